@@ -22,7 +22,7 @@ import yaml
 
 import memmlp
 from memmlp.cli.main import COMMANDS, commands
-from memmlp.common.components import collect_attribute, find, names
+from memmlp.common.components import collect_attribute, find_component, list_component_names
 from memmlp.common.settings import MISSING
 from memmlp.config.component_source import GROUPS
 from memmlp.config.plugins import packaged
@@ -140,7 +140,7 @@ def group_section(group: str, folder: Path, default: str | None) -> Iterator[str
     """A group's section: its options with their keys."""
     yield f"## {group}"
     sections = {path.stem: partial(file_section, path) for path in folder.glob("*.yaml")}
-    sections |= {name: partial(component_section, group, name) for name in names(group)}
+    sections |= {name: partial(component_section, group, name) for name in list_component_names(group)}
     sections |= {"default": partial(settings_section, ONLY[group], group)} if group in ONLY else {}
     if not sections:
         yield "Empty here: [your own packages](../guides/components.md) add options."
@@ -152,7 +152,7 @@ def group_section(group: str, folder: Path, default: str | None) -> Iterator[str
 
 def component_section(group: str, name: str) -> Iterator[str]:
     """A component's words, its keys, and what else it sets."""
-    settings = find(group, name).settings
+    settings = find_component(group, name).settings
     yield from settings_section(
         settings, {"generator": "data.synth", "loggers": f"loggers.{name}"}.get(group, group)
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import evaluation_id_of
+from memmlp.runs.identity import hash_evaluation_settings
 from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 from memmlp.runs.run import Run
 
@@ -100,7 +100,7 @@ def losses(steps: int) -> list[tuple[str, int, float]]:
 def an_outdated_evaluation(run: Run) -> Path:
     """Write an evaluation of an earlier component version, and return its file."""
     settings = {"mode": "stream", "ik": "off"}
-    path = run.evaluation(evaluation_id_of(settings))
+    path = run.evaluation(hash_evaluation_settings(settings))
     versions = {"mode.stream": 0}
     write_report(
         path,

@@ -48,7 +48,7 @@ from memmlp.networks.predictor import (
 )
 from memmlp.networks.recurrent_poser import CELLS
 from memmlp.networks.streaming import streaming
-from memmlp.runs.identity import version_of
+from memmlp.runs.identity import find_version
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
     AGRoLLoss,
@@ -386,12 +386,14 @@ def record() -> None:
     known = {
         case: before[case]["numbers"]
         for case in CASES
-        if before.get(case, {}).get("recipe") == version_of(case)
+        if before.get(case, {}).get("recipe") == find_version(case)
     }
     wrong = [case for case, old in known.items() if old.keys() & changed(now[case], old, tolerance(case))]
     if wrong:
         sys.exit(f"raise the version of {', '.join(wrong)}: their numbers changed")
-    kept = {case: {"recipe": version_of(case), "numbers": now[case] | known.get(case, {})} for case in CASES}
+    kept = {
+        case: {"recipe": find_version(case), "numbers": now[case] | known.get(case, {})} for case in CASES
+    }
     PATH.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
 
 

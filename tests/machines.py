@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from memmlp.common import files, lease
-from memmlp.common.lease import Changes
+from memmlp.common.lease import ChangeTimer
 
 
 class Clock:
@@ -33,7 +33,7 @@ class OwnChanges(threading.local):
     """The changes that each machine has seen, by a common clock."""
 
     def __init__(self, clock: Clock):
-        self.seconds_unchanged = Changes(clock).seconds_unchanged
+        self.seconds_unchanged = ChangeTimer(clock).seconds_unchanged
 
 
 class OwnLeases(threading.local, UserDict):
@@ -43,8 +43,8 @@ class OwnLeases(threading.local, UserDict):
 def apart(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Let every thread be a machine. No lease is renewed by itself, and the clock stands until it is set."""
     clock = Clock()
-    monkeypatch.setattr(lease, "process_space", lambda: threading.current_thread().name)
-    monkeypatch.setattr(lease, "_changes", OwnChanges(clock))
+    monkeypatch.setattr(lease, "process_namespace", lambda: threading.current_thread().name)
+    monkeypatch.setattr(lease, "_change_timer", OwnChanges(clock))
     monkeypatch.setattr(lease, "_leases", OwnLeases())
     monkeypatch.setattr(lease, "BEAT", 1e6)
     return clock
@@ -126,7 +126,7 @@ def taken(lock: lease.Lock) -> Iterator[lease.Lease]:
 @contextlib.contextmanager
 def fenced(folder: Path, fence: Any) -> Iterator[None]:
     """Use an object with `number` and `check` as this process' lease on a folder."""
-    key = lease._resolved(folder)
+    key = lease._resolve_folder(folder)
     lease._leases[key] = fence
     try:
         yield

@@ -33,7 +33,7 @@ def registers_kept() -> Iterator[None]:
         for one, content in zip(REGISTERS, before, strict=True):
             one.clear()
             one.update(content)  # type: ignore[arg-type]
-        components.declared.cache_clear()
+        components.collect_components.cache_clear()
         for name in set(sys.modules) - modules:
             if name.split(".")[0] in (PACKAGE, "mine", "other", "helper", "lab") and ":" not in name:
                 del sys.modules[name]

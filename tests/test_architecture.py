@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from memmlp.runs.environment import NOT_NUMBERS, PACKAGE, WIRING, code_digests
+from memmlp.runs.environment import NOT_NUMBERS, PACKAGE, WIRING, compute_code_digests
 
 
 def test_lists_of_sources_name_existing_files():
     """A renamed folder must not begin to count, and a renamed file must not drop out."""
     assert [folder for folder in NOT_NUMBERS if not (PACKAGE / folder).exists()] == []
-    assert set(WIRING) <= set(code_digests())
+    assert set(WIRING) <= set(compute_code_digests())
 
 
 def test_refusals_are_asserted():

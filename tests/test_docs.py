@@ -21,7 +21,7 @@ from own_package import PACKAGE, registers_kept
 
 from memmlp.cli.main import COMMANDS, commands
 from memmlp.cli.workers import Workers, split_executor
-from memmlp.common.components import names as component_names
+from memmlp.common.components import list_component_names as component_names
 from memmlp.config.build import untrained
 from memmlp.config.compose import compose_plain, composed, parse, preflight
 from memmlp.config.compose_plan import find_sweep

@@ -6,8 +6,8 @@ import golden
 import pytest
 from golden import changed, tolerance
 
-from memmlp.common.components import declared
-from memmlp.runs.identity import VERSIONS, version_of
+from memmlp.common.components import collect_components
+from memmlp.runs.identity import VERSIONS, find_version
 
 
 @pytest.mark.slow
@@ -15,14 +15,14 @@ from memmlp.runs.identity import VERSIONS, version_of
 def test_a_component_computes_the_numbers_of_its_version(case: str):
     """Otherwise different numbers would share a run id."""
     known = golden.stored()[case]
-    assert known["recipe"] == version_of(case), f"record the numbers of {case}: make golden"
+    assert known["recipe"] == find_version(case), f"record the numbers of {case}: make golden"
     now = golden.numbers(case)
     wrong = changed(now, known["numbers"], tolerance(case))
     assert not wrong, f"raise the version of {case}: it differs in {wrong[:4]}"
 
 
 def test_every_component_has_numbers():
-    named = {f"{slot}.{name}" for slot, name in declared() if slot != "loggers"}
+    named = {f"{slot}.{name}" for slot, name in collect_components() if slot != "loggers"}
     named -= {"optim.adamw"}  # its numbers are those of training
     assert set(golden.CASES) | set(golden.UNSEEN) == set(VERSIONS) | named
 

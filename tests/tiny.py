@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import yaml
 
-from memmlp.common.components import find, names
+from memmlp.common.components import find_component, list_component_names
 from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.geometry import motion_frames
@@ -93,7 +93,9 @@ def model(
     torch.manual_seed(seed)
     slot = memory(kind, **changes)
     torch.manual_seed(seed)
-    head = find("predictor", predictor.name).build({"depth": 1}, memory_block=slot.make_memory_block, **SIZES)
+    head = find_component("predictor", predictor.name).build(
+        {"depth": 1}, memory_block=slot.make_memory_block, **SIZES
+    )
     return MemMLP(normalizer(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
 
 
@@ -148,7 +150,7 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
 
 def tiny_sizes(name: str) -> dict[str, Any]:
     """Return the sizes that a network declares for the tiny profile."""
-    defaults = vars(find("model", name).make_settings({}))
+    defaults = vars(find_component("model", name).make_settings({}))
     return {
         key: yaml.safe_load(value.removeprefix("${size:").split(",")[0])
         for key, value in defaults.items()
@@ -156,16 +158,16 @@ def tiny_sizes(name: str) -> dict[str, Any]:
     }
 
 
-for new in set(names("model")) - {*BASELINES, "mem_mlp", "recurrent_poser", "constant_pose"}:
+for new in set(list_component_names("model")) - {*BASELINES, "mem_mlp", "recurrent_poser", "constant_pose"}:
     BASELINES[new] = tiny_sizes(new)
     BASELINE_LOSSES[new] = partial(TermsLoss, rotation=1.0)
-WINDOWLESS = [name for name in BASELINES if issubclass(find("model", name).kind, WindowlessModel)]
+WINDOWLESS = [name for name in BASELINES if issubclass(find_component("model", name).kind, WindowlessModel)]
 """Baselines without a window, which are streams in both modes of evaluation."""
 
 
 def build_baseline(name: str, normalizer: Normalizer, **changes) -> MotionModel:
     """Make a tiny baseline."""
-    network = find("model", name)
+    network = find_component("model", name)
     return network.kind(normalizer, network.make_settings(BASELINES[name] | changes))
 
 

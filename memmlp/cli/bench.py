@@ -67,10 +67,10 @@ def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: 
     show(rows, rounds)
     if file:
         from memmlp.common.files import write_json
-        from memmlp.runs.environment import environment
+        from memmlp.runs.environment import describe_environment
 
         how = {"overrides": list(overrides), "rounds": rounds, "steps": steps, "threads": 1}
-        write_json(file, {**how, "made_by": environment(), "rows": rows})
+        write_json(file, {**how, "made_by": describe_environment(), "rows": rows})
 
 
 def export_all(

@@ -32,14 +32,16 @@ def demo(overrides: tuple[str, ...]) -> None:
     have, only the first network is trained.
     """
     from memmlp.cli.train_summary import show_side_by_side
-    from memmlp.runs.lookup import frames_seen, hardly_trained
+    from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
 
     started = time.monotonic()
     both = fits_recurrent_poser(overrides)  # before the minutes of the first network
     outcomes = train_demo(overrides) + (train_demo([*overrides, RECURRENT_POSER]) if both else [])
     if len(outcomes) == len(NETWORKS):
         show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
-        for remark in dict.fromkeys(filter(None, (hardly_trained(frames_seen(one.run)) for one in outcomes))):
+        for remark in dict.fromkeys(
+            filter(None, (warn_if_hardly_trained(count_training_frames(one.run)) for one in outcomes))
+        ):
             click.echo(remark)
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
     click.echo(next_steps(overrides, inactive_environment(), [one.run.id for one in outcomes]))

@@ -228,7 +228,7 @@ def serve(given: LiveOptions) -> None:
     from memmlp.live.session import server as page
     from memmlp.live.session.loop import Fitting, make_greeting, run_loop
     from memmlp.live.stream import Stream
-    from memmlp.runs.lookup import find_run, frames_seen, hardly_trained
+    from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
 
     with contextlib.closing(make_source(given)) as source:
         file, name = network_file(given)
@@ -242,7 +242,7 @@ def serve(given: LiveOptions) -> None:
         files = page.read_files(vrm)
         outputs = make_outputs(given, stream)
         run = None if given.is_file else find_run(given.outputs, given.network)
-        remark = hardly_trained(frames_seen(run)) if run else ""
+        remark = warn_if_hardly_trained(count_training_frames(run)) if run else ""
         hub = page.Hub(make_greeting(source, name, outputs, remark, avatar is not None))
         fitting = Fitting(stream, source.space, given.calibration, hub.publish_state) if source.worn else None
         ask = fitting.ask if fitting else None

@@ -54,7 +54,7 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
     started = [run for run in list_runs(outputs) if run.manifest]
     warnings: list[str] = []
     for logger in _loggers(names or ("mlflow",), uri, project, outputs):
-        counts = run_loggers.sync(logger, progress_bar(started, logger.name), warnings.append, full)
+        counts = run_loggers.sync_runs(logger, progress_bar(started, logger.name), warnings.append, full)
         live = f", {counts['live']} are in progress" if counts["live"] else ""
         runs = f"{counts['shown'] + counts['same']} runs ({counts['shown']} of them now)"
         click.echo(f"{runs} are in {logger.place}{live}")

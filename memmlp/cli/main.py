@@ -16,8 +16,8 @@ import click
 import memmlp
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.common.processes import collect_garbage_rarely, termination_interrupts
-from memmlp.common.progress import announce_to
+from memmlp.common.processes import collect_garbage_rarely, treat_termination_as_interrupt
+from memmlp.common.progress import send_announcements_to
 
 
 class Command(NamedTuple):
@@ -105,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         collect_garbage_rarely()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        with termination_interrupts() if own else nullcontext():
+        with treat_termination_as_interrupt() if own else nullcontext():
             _run(arguments)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
@@ -125,7 +125,7 @@ def _run(arguments: list[str]) -> None:
     if arguments[:1] in (["-sc"], ["--shell-completion"]):
         _complete(arguments)
     else:
-        with announce_to():
+        with send_announcements_to():
             commands.main(arguments, prog_name="memmlp", standalone_mode=False)
 
 

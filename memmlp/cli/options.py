@@ -177,8 +177,8 @@ def check_runs(outputs: Path, *names: str) -> None:
 
 def remark_on(*runs: Run) -> None:
     """Print on standard error which of the runs' networks hardly saw motion in training."""
-    from memmlp.runs.lookup import frames_seen, hardly_trained
+    from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
 
     for run in runs:
-        if remark := hardly_trained(frames_seen(run)):
+        if remark := warn_if_hardly_trained(count_training_frames(run)):
             click.echo(f"run {run.id}: {remark}", err=True)

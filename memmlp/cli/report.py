@@ -30,9 +30,9 @@ def report(sweeps: tuple[str, ...], out: Path | None, no_replays: bool, outputs:
     from memmlp.cli.ui import predict
     from memmlp.report.ui.report_file import write_page
     from memmlp.report.ui.server import Answers
-    from memmlp.runs.environment import environment
+    from memmlp.runs.environment import describe_environment
 
-    facts = environment()
+    facts = describe_environment()
     git = facts["git"] or {}
     code = f"{git.get('commit', facts['version'])[:7]}{' with changes' if git.get('dirty') else ''}"
     about = datetime.now(UTC).strftime(f"Generated %Y-%m-%d %H:%M UTC, code {code}")

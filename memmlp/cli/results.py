@@ -60,7 +60,7 @@ def save_command(
     SWEEP and OVERRIDES are those of `memmlp sweep`. A file that has results of further runs is not replaced.
     """
     from memmlp.cli.table import shown_sweep
-    from memmlp.common.files import plain
+    from memmlp.common.files import make_json_safe
     from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import Kept, list_overrides, load_kept, save, shorten_paths
     from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
@@ -82,7 +82,7 @@ def save_command(
         shorten_paths(word for word in overrides if not word.startswith("seed=")),
         runs,
         list_overrides(sweep),
-        plain(asdict(shown.rounds)) if shown.rounds else None,
+        make_json_safe(asdict(shown.rounds)) if shown.rounds else None,
         flags,
     )
     if not kept.every:
@@ -182,7 +182,7 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
     from memmlp.config.compose_plan import find_sweep
     from memmlp.report.tables.build_table import make_table, restrict_clips
     from memmlp.report.tables.seed_rounds import Rounds
-    from memmlp.runs.identity import outdated
+    from memmlp.runs.identity import list_outdated
 
     # With the command line's overrides, the table warns of other data than its own.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)
@@ -203,7 +203,7 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
         sweep, runs, restricted = restrict_clips(sweep, kept.runs_of(sweep), source, patterns)
         flags = [*restricted, *([other] if other else [])]
         table = make_table(sweep, runs, command=kept.command)
-    changed = sorted({change for run in kept.every for change in outdated(run.origin.every_version)})
+    changed = sorted({change for run in kept.every for change in list_outdated(run.origin.every_version)})
     flags += [
         *kept.flags,
         *([f"made with earlier component versions: {', '.join(changed)}"] if changed else []),

@@ -18,11 +18,11 @@ from memmlp.runs.deployment_folder import (
     INT8_PRECISIONS,
     MAX_GROWTH,
     MAX_JITTER_GROWTH,
-    accurate_enough,
-    as_deployed,
-    deployed_precision,
+    find_deployed_precision,
+    is_accurate_enough,
+    select_deployed_measurements,
 )
-from memmlp.runs.lookup import frames_seen, hardly_trained
+from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
 from memmlp.training.request import Outcome
@@ -61,7 +61,7 @@ def run_warnings(run: Run) -> Iterator[str]:
             f"run {run.id} was made before the code of {names} changed, under the same component versions: "
             "force=true makes it again"
         )
-    if remark := hardly_trained(frames_seen(run)):
+    if remark := warn_if_hardly_trained(count_training_frames(run)):
         yield remark
 
 
@@ -79,7 +79,7 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
     errors = [results[name][mode][branch] for name, branch in columns]
     table = _error_table(f"side by side, {mode}", headers, errors)
     if all("latency" in own for own in results.values()):
-        costs = [as_deployed(results[name]["latency"]) for name, _ in columns]
+        costs = [select_deployed_measurements(results[name]["latency"]) for name, _ in columns]
         table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
         table.add_row("parameters", "M", *(f"{cost['parameters'] / 1e6:.2f}" for cost in costs))
     Console(highlight=False).print(table)
@@ -97,7 +97,7 @@ def _differing(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
     """Yield lines about the time of a frame in the requested exported file, and the network's size."""
-    measured, precision = as_deployed(record), deployed_precision(record)
+    measured, precision = select_deployed_measurements(record), find_deployed_precision(record)
     lower = precision != "fp32"
     file = f" in {precision}" if lower else ""
     yield (
@@ -106,7 +106,7 @@ def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
         + (f", fp32 {record['median_ms']:.2f} ms)" if lower else ")")
     )
     cost = record.get(precision) or {}
-    if precision in INT8_PRECISIONS and "jitter_growth" in cost and not accurate_enough(cost):
+    if precision in INT8_PRECISIONS and "jitter_growth" in cost and not is_accurate_enough(cost):
         yield warn(
             f"{precision}: MPJPE {cost['growth']:+.1%}, Jitter {cost['jitter_growth']:+.1%}, more than "
             f"{MAX_GROWTH:.0%} and {MAX_JITTER_GROWTH:.0%}: live use takes float32"

@@ -130,7 +130,7 @@ def _check_space(setup: Setup) -> str:
             config refuses a value.
     """
     from memmlp.common.files import digest
-    from memmlp.runs.identity import changes_training, inference, validated_on
+    from memmlp.runs.identity import affects_training, select_inference_config, select_validation_config
 
     space = setup.search.space
     for override in map(Override.parse, setup.command_line):
@@ -144,9 +144,9 @@ def _check_space(setup: Setup) -> str:
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
     configs = [request.config for request in requests]
-    first_validation = validated_on(configs[0])
+    first_validation = select_validation_config(configs[0])
     for config in configs[1:]:
-        other = validated_on(config)
+        other = select_validation_config(config)
         for key in sorted(first_validation.keys() | other.keys()):
             if first_validation.get(key) != other.get(key):
                 raise InputError(
@@ -155,13 +155,13 @@ def _check_space(setup: Setup) -> str:
                 )
     for one in space:
         # Some change it at other values than 0.
-        counts = any(changes_training(one.key, config) for config in configs)
+        counts = any(affects_training(one.key, config) for config in configs)
         if not isinstance(configs[0].get(one.key), Mapping) and not counts:
             raise InputError(f"search.space: {one.key}: does not change the training")
     first = _tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
     often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
     trained = digest([one.identity("").id for one in requests])  # what the first trial need not have
-    return f"{first.id}, {often}, used with {inference(first.config)}, trained with {trained}"
+    return f"{first.id}, {often}, used with {select_inference_config(first.config)}, trained with {trained}"
 
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:

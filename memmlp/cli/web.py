@@ -85,12 +85,14 @@ def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     from memmlp.live.web.site import SiteNetwork
     from memmlp.networks.streaming import check_streams
     from memmlp.runs.identity import flatten
-    from memmlp.runs.lookup import frames_seen, hardly_trained, run_name
+    from memmlp.runs.lookup import count_training_frames, get_run_name, warn_if_hardly_trained
 
     network = opened.network()
     check_streams(network)
     run, config = opened.run, flatten(opened.run.config)
-    name, model = run_name(run.manifest, config).removeprefix("default · "), config["model.name"]
+    name, model = get_run_name(run.manifest, config).removeprefix("default · "), config["model.name"]
     name = name if f"model={model}" in name else f"{model} {name}"
     keys = tuple(clip.key for clip in clips)
-    return SiteNetwork(run.id, name, run.id, network, keys, hardly_trained(frames_seen(run)))
+    return SiteNetwork(
+        run.id, name, run.id, network, keys, warn_if_hardly_trained(count_training_frames(run))
+    )

@@ -13,7 +13,7 @@ from uuid import uuid4
 
 import click
 
-from memmlp.common.errors import InputError, require
+from memmlp.common.errors import InputError, import_optional
 from memmlp.common.overrides import Override
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Workers:
     def options(self) -> Any:
         """Return the executor's own settings, checked. Raises InputError for a wrong one."""
         if self.executor == "slurm":
-            require("submitit", "slurm", "executor=slurm")
+            import_optional("submitit", "slurm", "executor=slurm")
             from memmlp.sweep.executors.slurm import slurm_options
 
             return slurm_options(self.settings)

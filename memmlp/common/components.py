@@ -105,7 +105,7 @@ class Component:
     def settings(self) -> type[Settings]:
         """The settings class, read without importing the module."""
         space = read_declarations(self.module, self.path)
-        if (settings := _of_option(space, self)) is None:  # it has no keys
+        if (settings := _find_decorated(space, self)) is None:  # it has no keys
             label = f"{self.slot}_{self.name}"
             settings = dataclass(type(label, (Settings,), {"__module__": space["__name__"]}))
             space[label] = component(self.slot, self.name)(settings)
@@ -115,7 +115,7 @@ class Component:
     def kind(self) -> type:
         """The class to build; reading this property imports its module."""
         module = importlib.import_module(self.module)
-        return getattr(module, self.builds) if self.builds else _of_option(vars(module), self)
+        return getattr(module, self.builds) if self.builds else _find_decorated(vars(module), self)
 
     def build(self, node: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
         """Build the component from its keys in the config and further arguments.
@@ -128,33 +128,33 @@ class Component:
 
     def make_settings(self, node: Mapping[str, Any]) -> Any:
         """Return the settings with the values of a config; this imports the component's module."""
-        kind: Any = _of_option(vars(importlib.import_module(self.module)), self)
+        kind: Any = _find_decorated(vars(importlib.import_module(self.module)), self)
         return kind(**{key: value for key, value in node.items() if key != "name"})
 
 
-def find(slot: str, name: str) -> Component:
+def find_component(slot: str, name: str) -> Component:
     """Return the component with a name in a slot.
 
     Raises:
         InputError: if no package in use declares it.
     """
     try:
-        return declared()[slot, name]
+        return collect_components()[slot, name]
     except KeyError:
         raise InputError(
-            f"{slot}={name}: must be {' or '.join(names(slot)) or 'an option of a plugin'}"
+            f"{slot}={name}: must be {' or '.join(list_component_names(slot)) or 'an option of a plugin'}"
         ) from None
 
 
-def names(slot: str) -> list[str]:
+def list_component_names(slot: str) -> list[str]:
     """Return the names of the components of a slot, in alphabetical order."""
-    return sorted(name for group, name in declared() if group == slot)
+    return sorted(name for group, name in collect_components() if group == slot)
 
 
-def chosen(config: Mapping[str, Any], slot: str) -> type[Settings] | None:
+def find_chosen_settings(config: Mapping[str, Any], slot: str) -> type[Settings] | None:
     """Return the settings class of the component in a config's slot; None if the slot is empty."""
     node = config.get(slot)
-    return find(slot, node["name"]).settings if node else None
+    return find_component(slot, node["name"]).settings if node else None
 
 
 def collect_attribute(kind: type[Settings], attribute: str) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def collect_attribute(kind: type[Settings], attribute: str) -> dict[str, Any]:
 
 
 @functools.cache
-def declared() -> dict[tuple[str, str], Component]:
+def collect_components() -> dict[tuple[str, str], Component]:
     """Return all components by slot and name, including components of users' packages.
 
     Raises:
@@ -173,7 +173,7 @@ def declared() -> dict[tuple[str, str], Component]:
     found: dict[tuple[str, str], Component] = {}
     for package, root in _roots.items():
         for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
-            for one in _in_file(package, path):
+            for one in _parse_components(package, path):
                 if other := found.get((one.slot, one.name)):
                     raise InputError(
                         f"{path}: {one.slot}={one.name} exists already in {other.path}; rename one of them"
@@ -191,16 +191,16 @@ def add_package(package: str, root: Path | None) -> None:
     _roots.pop(package, None)
     if root:
         _roots[package] = root
-    declared.cache_clear()
+    collect_components.cache_clear()
     try:
-        declared()
+        collect_components()
     except InputError:
         _roots.pop(package, None)
-        declared.cache_clear()
+        collect_components.cache_clear()
         raise
 
 
-def _in_file(package: str, path: Path) -> Iterable[Component]:
+def _parse_components(package: str, path: Path) -> Iterable[Component]:
     text = path.read_text(encoding="utf-8")
     if "\n@component(" not in text:
         return
@@ -228,7 +228,7 @@ def read_declarations(module: str, path: Path) -> dict[str, Any]:
             if PLAIN.fullmatch(node.module):
                 kept.append(node)
             elif any(one.name.endswith("Settings") for one in node.names):
-                vars(space).update(_imported(node))
+                vars(space).update(_read_imported_settings(node))
         elif (isinstance(node, ast.ClassDef) and node.name.endswith("Settings")) or _is_constant(node):
             kept.append(node)
     code = compile(ast.Module(kept, []), str(path), "exec", __future__.annotations.compiler_flag, True)
@@ -240,7 +240,7 @@ def read_declarations(module: str, path: Path) -> dict[str, Any]:
     return vars(space)
 
 
-def _imported(node: ast.ImportFrom) -> dict[str, Any]:
+def _read_imported_settings(node: ast.ImportFrom) -> dict[str, Any]:
     """Return the settings classes that a statement imports from another module of a package in use."""
     module = str(node.module)
     for package, root in _roots.items():
@@ -261,7 +261,7 @@ def _is_constant(node: ast.stmt) -> bool:
     return True
 
 
-def _of_option(namespace: Mapping[str, Any], one: Component) -> Any:
+def _find_decorated(namespace: Mapping[str, Any], one: Component) -> Any:
     """Return the object in a module's namespace that declares the component; None if there is none."""
     option = f"{one.slot}={one.name}"
     return next(

@@ -81,7 +81,7 @@ def broadcast(value: T) -> T:
 
 
 @contextlib.contextmanager
-def share_batch() -> Iterator[None]:
+def split_batch() -> Iterator[None]:
     """In this context, batches are split: each process works on its own rows."""
     _Step.shared = world_size() > 1
     try:
@@ -90,12 +90,12 @@ def share_batch() -> Iterator[None]:
         _Step.shared = False
 
 
-def is_shared() -> bool:
-    """Return whether this process works on its own rows of a batch, inside `share_batch()`."""
+def is_batch_split() -> bool:
+    """Return whether this process works on its own rows of a batch, inside `split_batch()`."""
     return _Step.shared
 
 
-def local_rows(batch: Tensor) -> Tensor:
+def take_local_rows(batch: Tensor) -> Tensor:
     """Return this process' rows of a whole batch (B, ...); B is a multiple of the number of processes."""
     return batch.chunk(world_size())[rank()] if _Step.shared else batch
 
@@ -121,7 +121,7 @@ def draw_rows(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     """
     if not _Step.shared:
         return draw(like)
-    return local_rows(draw(like.detach().repeat(world_size(), *[1] * (like.dim() - 1))))
+    return take_local_rows(draw(like.detach().repeat(world_size(), *[1] * (like.dim() - 1))))
 
 
 def average(values: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from types import ModuleType
 BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, line and paragraph separators
 
 
-def one_line(text: str) -> str:
+def escape_line_breaks(text: str) -> str:
     r"""Return the text with line breaks and control characters escaped, such as \n."""
     return "".join(repr(c)[1:-1] if unicodedata.category(c) in BREAKING else c for c in text)
 
@@ -22,10 +22,10 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(one_line(message))
+        super().__init__(escape_line_breaks(message))
 
 
-def why_unreadable(error: Exception) -> str:
+def describe_read_error(error: Exception) -> str:
     """Return the reason why a text or YAML file could not be read, without the file's name."""
     if isinstance(error, OSError):
         return "no such file" if error.errno == errno.ENOENT else error.strerror or str(error)
@@ -35,12 +35,12 @@ def why_unreadable(error: Exception) -> str:
 
 
 def check_installed(package: str, extra: str, purpose: str) -> None:
-    """Raise InputError if an optional package is not installed; see `require`."""
+    """Raise InputError if an optional package is not installed; see `import_optional`."""
     if find_spec(package) is None:
         raise InputError(f"{purpose}: needs {package}: pip install 'memmlp[{extra}]'")
 
 
-def require(module: str, extra: str, purpose: str) -> ModuleType:
+def import_optional(module: str, extra: str, purpose: str) -> ModuleType:
     """Import and return a module of an optional package.
 
     Args:

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from memmlp.common.lease import publish, temporary
+from memmlp.common.lease import publish, temporary_path
 
 
 def now() -> str:
@@ -28,15 +28,15 @@ def to_number(value: Any) -> Any:
     return float(value) if value in ("nan", "inf", "-inf") else value
 
 
-def plain(value: Any) -> Any:
+def make_json_safe(value: Any) -> Any:
     """Return the value in a form that can be stored as JSON.
 
     Tuples become lists, keys become strings, and NaN and infinities become strings.
     """
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): make_json_safe(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [make_json_safe(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value
@@ -57,7 +57,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     Raises:
         LeaseLost: if this process lost its lease of the file's folder (memmlp.common.lease).
     """
-    unfinished = temporary(path)
+    unfinished = temporary_path(path)
     try:
         with open(unfinished, "wb") as file:
             yield file
@@ -73,7 +73,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON atomically; the keys keep their order."""
-    atomic_write(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
+    atomic_write(path, json.dumps(make_json_safe(value), indent=2, allow_nan=False) + "\n")
 
 
 def sync_folder(folder: Path) -> None:

@@ -48,24 +48,24 @@ ENDED = ("Z", "X")  # states of an ended process that its parent has not collect
 
 
 @functools.cache
-def process_space() -> str:
+def process_namespace() -> str:
     """Return a digest of machine, boot and container; together with it, a pid identifies a process."""
     try:
         namespace = os.readlink(PROC / "self/ns/pid")
     except OSError:
         namespace = ""
-    parts = [platform.node(), _text(PROC / "sys/kernel/random/boot_id"), namespace]
+    parts = [platform.node(), _read_text(PROC / "sys/kernel/random/boot_id"), namespace]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
 
 
 def current_process() -> dict[str, Any]:
     """Describe this process; other processes can pass the description to `is_alive`."""
-    return {"pid": os.getpid(), "born": _birth(os.getpid()), "place": process_space()}
+    return {"pid": os.getpid(), "born": _read_start_time(os.getpid()), "place": process_namespace()}
 
 
 def is_alive(process: Mapping[str, Any]) -> bool | None:
     """Return whether a process (`current_process`) is alive; None if it runs on another machine."""
-    if process.get("place") != process_space():
+    if process.get("place") != process_namespace():
         return None
     pid = int(process["pid"])
     try:
@@ -74,28 +74,30 @@ def is_alive(process: Mapping[str, Any]) -> bool | None:
         return False
     except PermissionError:  # the process belongs to another user
         pass
-    return _stat(pid)[:1] not in [[state] for state in ENDED] and _birth(pid) == process.get("born")
+    return _read_process_fields(pid)[:1] not in [[state] for state in ENDED] and _read_start_time(
+        pid
+    ) == process.get("born")
 
 
-def _birth(pid: int) -> str | None:
+def _read_start_time(pid: int) -> str | None:
     """Return the start time of a process in kernel ticks; it tells processes with the same pid apart."""
-    fields = _stat(pid)
+    fields = _read_process_fields(pid)
     return fields[19] if len(fields) > 19 else None
 
 
-def _stat(pid: int) -> list[str]:
+def _read_process_fields(pid: int) -> list[str]:
     """Return the fields of /proc/PID/stat from the process state on; empty without /proc."""
-    return _text(PROC / str(pid) / "stat").rpartition(")")[2].split()
+    return _read_text(PROC / str(pid) / "stat").rpartition(")")[2].split()
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return path.read_text()
     except OSError:
         return ""
 
 
-class Changes:
+class ChangeTimer:
     """Measures for how long values have been unchanged, by a clock that never jumps."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
@@ -118,7 +120,7 @@ class Changes:
         return before - last[1]
 
 
-_changes = Changes()
+_change_timer = ChangeTimer()
 _leases: dict[Path, Lease] = {}
 """The leases of this process, by folder."""
 
@@ -182,7 +184,7 @@ class Lock:
             report: gets a line if this process has to wait; by default, the line goes to stderr.
             wait: whether to wait while another process holds the lock.
         """
-        key, thread = _resolved(self.target), (os.getpid(), threading.get_ident())
+        key, thread = _resolve_folder(self.target), (os.getpid(), threading.get_ident())
         if key in _leases and _leases[key].thread == thread:
             yield _leases[key]
             return
@@ -190,7 +192,7 @@ class Lock:
         lease = self._try_to_claim()
         if lease is None and wait:
             line = f"{self.description} is in use by {self.holder_description}; waiting until it is free"
-            (report or _to_stderr)(line)
+            (report or _print_to_stderr)(line)
             while (lease := self._try_to_claim()) is None:
                 time.sleep(PAUSE)
         if lease is None:
@@ -215,7 +217,7 @@ class Lock:
         owner = self.owner
         if not owner:
             return "another process"
-        where = "" if owner["place"] == process_space() else " on another machine"
+        where = "" if owner["place"] == process_namespace() else " on another machine"
         return f"process {owner['pid']}{where} since {owner['since']}"
 
     @property
@@ -235,7 +237,7 @@ class Lock:
             claims.append(self._read_last_claim())
             return claims[-1]
 
-        idle = _changes.seconds_unchanged((self.folder.absolute(), self.prefix), read)
+        idle = _change_timer.seconds_unchanged((self.folder.absolute(), self.prefix), read)
         return claims[-1], idle
 
     def _read_last_claim(self) -> Claim | None:
@@ -343,13 +345,13 @@ def check_owner(path: Path) -> None:
     Call this before appending to a file or removing it. It can't detect a freeze between the check and the
     write.
     """
-    if lease := _lease_of(path):
+    if lease := _find_lease(path):
         lease.check()
 
 
-def temporary(path: Path) -> Path:
+def temporary_path(path: Path) -> Path:
     """Return a unique path, in the same folder, under which a file or folder is written before `publish`."""
-    lease = _lease_of(path)
+    lease = _find_lease(path)
     owner = f".lease-{lease.number}" if lease else ""
     return path.with_name(f".{path.name}{owner}.{uuid.uuid4().hex[:12]}.tmp")
 
@@ -358,7 +360,7 @@ def publish(unfinished: Path, path: Path) -> None:
     """Move a finished file or folder to its final path.
 
     Args:
-        unfinished: the path from `temporary`.
+        unfinished: the path from `temporary_path`.
         path: the final path.
 
     Raises:
@@ -384,16 +386,16 @@ def _remove_unfinished(folder: Path, number: int) -> None:
             path.unlink(missing_ok=True)
 
 
-def _lease_of(path: Path) -> Lease | None:
+def _find_lease(path: Path) -> Lease | None:
     """Return this process' lease of a folder that contains the path; None if there is no lease."""
-    resolved = _resolved(path)
+    resolved = _resolve_folder(path)
     return next((_leases[one] for one in (resolved, *resolved.parents) if one in _leases), None)
 
 
-def _resolved(path: Path) -> Path:
+def _resolve_folder(path: Path) -> Path:
     """Return the path with links in its parent folder resolved; a link at its end is kept."""
     return Path(os.path.realpath(path.parent)) / path.name
 
 
-def _to_stderr(line: str) -> None:
+def _print_to_stderr(line: str) -> None:
     print(f"memmlp: {line}", file=sys.stderr, flush=True)

@@ -17,7 +17,7 @@ from http.client import HTTPException
 from pathlib import Path
 from urllib.error import URLError
 
-from memmlp.common.errors import InputError, why_unreadable
+from memmlp.common.errors import InputError, describe_read_error
 from memmlp.common.files import atomic_write
 from memmlp.common.progress import announce
 
@@ -78,7 +78,7 @@ IWER = Package(  # a headset in software, for tests
 )
 
 
-def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
+def read_package_files(package: Package, names: Collection[str]) -> dict[str, bytes]:
     """Return the content of files in a package, by file name, such as "dist/ort.min.mjs".
 
     Raises:
@@ -86,7 +86,7 @@ def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
         KeyError: if the package does not have a file.
     """
     found = {}
-    with tarfile.open(tarball(package), "r:gz") as archive:
+    with tarfile.open(fetch_tarball(package), "r:gz") as archive:
         for member in archive:
             name = member.name.split("/", 1)[-1]  # all lie in one folder, usually "package"
             if member.isfile() and name in names and (file := archive.extractfile(member)):
@@ -98,7 +98,7 @@ def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
     return found
 
 
-def tarball(package: Package) -> Path:
+def fetch_tarball(package: Package) -> Path:
     """Return a package's tarball, downloading it if it is not in the cache; its digest is checked.
 
     Raises:
@@ -108,20 +108,20 @@ def tarball(package: Package) -> Path:
         if _has_digest(package, path.read_bytes()):
             return path
         raise InputError(f"{path}: must be {package} with the pinned digest {package.integrity[:20]}...")
-    path = cache() / package.file
+    path = cache_folder() / package.file
     if not (path.is_file() and _has_digest(package, path.read_bytes())):
-        content = _download(package, registry())
+        content = _download(package, registry_url())
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, content)
     return path
 
 
-def cache() -> Path:
+def cache_folder() -> Path:
     """Return the folder where downloaded tarballs are kept."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "memmlp" / "npm"
 
 
-def registry() -> str:
+def registry_url() -> str:
     """Return the address of the registry."""
     given = (value for name, value in os.environ.items() if name.upper() == "NPM_CONFIG_REGISTRY")
     if address := next(given, ""):
@@ -131,13 +131,13 @@ def registry() -> str:
 
 def _download(package: Package, host: str) -> bytes:
     """Download a package's tarball. Raises InputError if the download fails or has a wrong digest."""
-    announce(f"download {package} from the npm registry and keep it in {cache()}")
+    announce(f"download {package} from the npm registry and keep it in {cache_folder()}")
     instead = f"or run npm pack {package} and set {FOLDER} to the folder with {package.file}"
     try:
         with urllib.request.urlopen(package.url(host), timeout=TIMEOUT) as answer:
             content = answer.read(MAX_SIZE)
     except (OSError, ValueError, HTTPException) as error:  # a ValueError: not a valid address
-        reason = error.reason if isinstance(error, URLError) else why_unreadable(error)
+        reason = error.reason if isinstance(error, URLError) else describe_read_error(error)
         raise InputError(
             f"{package}: cannot be downloaded from the npm registry ({reason}); try again, {instead}"
         ) from None

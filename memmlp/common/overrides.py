@@ -53,15 +53,15 @@ def parse_overrides(texts: Iterable[str]) -> list[Override]:
     return [Override.parse(text) for text in texts]
 
 
-def last_by_key(texts: Iterable[str]) -> dict[str, Override]:
+def select_last_by_key(texts: Iterable[str]) -> dict[str, Override]:
     """Return the last override of each key, in the order in which the keys first appear."""
     return {override.key: override for override in parse_overrides(texts)}
 
 
-def value_text(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Return a value as the text to use in an override."""
     if isinstance(value, list):
-        return f"[{','.join(map(value_text, value))}]"
+        return f"[{','.join(map(format_value, value))}]"
     if value is None:
         return "null"
     return str(value).lower() if isinstance(value, bool) else str(value)

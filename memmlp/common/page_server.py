@@ -38,12 +38,12 @@ def read_page_file(package: str, name: str) -> bytes:
     return resources.files(package).joinpath("page", *name.split("/")).read_bytes()
 
 
-def content_type(name: str) -> str:
+def find_content_type(name: str) -> str:
     """Return the content type for a file name."""
     return f"{TYPES[name.rsplit('.', 1)[-1]]}; charset=utf-8"
 
 
-def security_policy(index: str, *scripts: str) -> str:
+def build_security_policy(index: str, *scripts: str) -> str:
     """Return a page's Content-Security-Policy; it allows the page's own scripts and import map only.
 
     Args:
@@ -60,7 +60,7 @@ def security_policy(index: str, *scripts: str) -> str:
     )
 
 
-class Access:
+class AccessRules:
     """The access rules of a server.
 
     Args:
@@ -83,7 +83,7 @@ class Access:
         if self.token is None:
             host = headers.get("Host", "")
             return (host.rpartition(":")[0] or host) in (HOST, "localhost", self.host)
-        given = dict(urllib.parse.parse_qsl(url.query)).get("token", "") or _cookie(headers, port)
+        given = dict(urllib.parse.parse_qsl(url.query)).get("token", "") or _read_cookie(headers, port)
         return secrets.compare_digest(given.encode(), self.token.encode())
 
     def allows_change(self, path: str, headers: Message, port: int) -> bool:
@@ -108,7 +108,7 @@ def check_token(host: str, token: str | None) -> None:
         raise InputError(f"--token: must have at least {MIN_LENGTH} characters")
 
 
-def _cookie(headers: Message, port: int) -> str:
+def _read_cookie(headers: Message, port: int) -> str:
     try:
         cookie = SimpleCookie(headers.get("Cookie", "")).get(f"{COOKIE}_{port}")
     except CookieError:
@@ -195,7 +195,7 @@ class PageServer(ThreadingHTTPServer):
     def __init__(
         self, handler: type[PageHandler], port: int, host: str = HOST, token: str | None = None
     ) -> None:
-        self.access = Access(host, token)
+        self.access = AccessRules(host, token)
         try:
             super().__init__((host, port), handler)
         except (OSError, OverflowError) as error:
@@ -216,7 +216,7 @@ class PageServer(ThreadingHTTPServer):
 
         If the server listens at all addresses, this is the address for other machines.
         """
-        name = own_address() if self.server_name == EVERYWHERE else self.server_name
+        name = find_own_address() if self.server_name == EVERYWHERE else self.server_name
         token = self.access.token
         return f"http://{name}:{self.server_port}/" + (f"?token={urllib.parse.quote(token)}" if token else "")
 
@@ -238,7 +238,7 @@ class PageServer(ThreadingHTTPServer):
         self.server_close()
 
 
-def own_address() -> str:
+def find_own_address() -> str:
     """Return the address at which other machines can reach this one; no data is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:

@@ -43,7 +43,7 @@ def finish_uninterrupted(finish: Callable[[], object]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def termination_interrupts() -> Iterator[None]:
+def treat_termination_as_interrupt() -> Iterator[None]:
     """Treat SIGTERM like Ctrl-C during the context."""
 
     def interrupt(number: int, frame: object) -> None:
@@ -56,7 +56,7 @@ def termination_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def import_environment() -> dict[str, str]:
+def build_import_variables() -> dict[str, str]:
     """Return environment variables with which another Python process imports the same modules.
 
     Without them, `python -m` searches the working folder first. It may contain another copy of the package.
@@ -77,10 +77,10 @@ def import_environment() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def children_import_the_same() -> Iterator[None]:
-    """Set `import_environment` in this process during the context, so that child processes inherit it."""
-    before = {name: os.environ.get(name) for name in import_environment()}
-    os.environ.update(import_environment())
+def pass_import_paths_to_children() -> Iterator[None]:
+    """Set `build_import_variables` in this process during the context, so that child processes inherit it."""
+    before = {name: os.environ.get(name) for name in build_import_variables()}
+    os.environ.update(build_import_variables())
     try:
         yield
     finally:
@@ -91,7 +91,7 @@ def children_import_the_same() -> Iterator[None]:
                 os.environ[name] = value
 
 
-class CoreClock:
+class CoreUsageTimer:
     """Measures the fraction of time in which the calling thread ran on a CPU core.
 
     Other threads are not counted. Use it only where the calling thread does all the work, such as in a

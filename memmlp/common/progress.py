@@ -20,19 +20,19 @@ _label: ContextVar[str] = ContextVar("label of the larger work", default="")
 _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener to lines about work", default=None)
 
 
-def to_stderr(line: str) -> None:
+def print_to_stderr(line: str) -> None:
     """Write a line to stderr."""
     print(line, file=sys.stderr, flush=True)
 
 
-def to_log(line: str) -> None:
+def print_unless_terminal(line: str) -> None:
     """Write a line to stderr, unless stderr is a terminal: a terminal shows progress bars instead."""
     if not sys.stderr.isatty():
-        to_stderr(line)
+        print_to_stderr(line)
 
 
 @contextmanager
-def announce_to(listener: Callable[[str], None] = to_log) -> Iterator[None]:
+def send_announcements_to(listener: Callable[[str], None] = print_unless_terminal) -> Iterator[None]:
     """Send announcements and progress lines of this context to a listener."""
     token = _listener.set(listener)
     try:
@@ -42,7 +42,7 @@ def announce_to(listener: Callable[[str], None] = to_log) -> Iterator[None]:
 
 
 def announce(line: str) -> None:
-    """Send a line to the listener (`announce_to`), if there is one, such as the name of the next step."""
+    """Send a line, such as the name of the next step, to the listener of `send_announcements_to`."""
     if listener := _listener.get():
         listener(line)
 
@@ -50,7 +50,7 @@ def announce(line: str) -> None:
 def notify(line: str) -> None:
     """Send a line that the user should see, such as skipped files; unlike `announce`, also on a terminal."""
     if listener := _listener.get():
-        (to_stderr if listener is to_log else listener)(line)
+        (print_to_stderr if listener is print_unless_terminal else listener)(line)
 
 
 @contextmanager
@@ -63,10 +63,10 @@ def label_progress(name: str) -> Iterator[None]:
         _label.reset(token)
 
 
-class Count:
+class ProgressCounter:
     """Counts the finished items of some work.
 
-    A terminal shows a bar. A listener (`announce_to`) gets a line every INTERVAL seconds.
+    A terminal shows a bar. A listener (`send_announcements_to`) gets a line every INTERVAL seconds.
 
     Args:
         display: draws the bar.
@@ -105,7 +105,7 @@ class Count:
 @contextmanager
 def show_progress(
     description: str, total: float | None, done: int = 0, shown: bool = True, unit: str = ""
-) -> Iterator[Count]:
+) -> Iterator[ProgressCounter]:
     """Show the progress of some work on stderr: description, bar, count, elapsed and remaining time, a note.
 
     Args:
@@ -134,7 +134,7 @@ def show_progress(
     )
     label = ", ".join(filter(None, (_label.get(), description)))
     with display:
-        yield Count(display, display.add_task(label, total=total, completed=done, note=""), unit)
+        yield ProgressCounter(display, display.add_task(label, total=total, completed=done, note=""), unit)
 
 
 def progress_bar(

@@ -105,7 +105,7 @@ def existing(kind: str, *words: str) -> Rule:
     return Rule(" or ".join([f"an existing {kind}", *words]), allows)
 
 
-def clip_folders() -> Rule:
+def existing_clip_folders() -> Rule:
     """Return the rule that a value must be the path of an existing folder, or a list of such paths."""
 
     def allows(value: Any) -> bool:
@@ -134,7 +134,7 @@ def setting(rule: Rule | None = None, default: Any = MISSING, **by_profile: Any)
     """
     metadata = {"rule": rule}
     if "literal" in by_profile:
-        return field(default=_choice("reading", default, by_profile["literal"]), metadata=metadata)
+        return field(default=_format_choice("reading", default, by_profile["literal"]), metadata=metadata)
     if by_profile:
         return field(default=sized(**by_profile), metadata=metadata)
     if isinstance(default, list | dict):
@@ -144,10 +144,10 @@ def setting(rule: Rule | None = None, default: Any = MISSING, **by_profile: Any)
 
 def sized(tiny: Any, small: Any, paper: Any, width_fraction: float = 0) -> str:
     """Return the config text that lets `profile.sizes` choose one of three values (`setting`)."""
-    return _choice("size", tiny, small, paper, *([width_fraction] if width_fraction else []))
+    return _format_choice("size", tiny, small, paper, *([width_fraction] if width_fraction else []))
 
 
-def _choice(resolver: str, *values: Any) -> str:
+def _format_choice(resolver: str, *values: Any) -> str:
     words = ("null" if value is None else str(value).lower() for value in values)
     return f"${{{resolver}:{','.join(words)}}}"
 

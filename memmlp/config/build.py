@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from memmlp.common.components import Component, chosen, find
+from memmlp.common.components import Component, find_chosen_settings, find_component
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
 from memmlp.config.build_request import build_request, shares
@@ -97,7 +97,7 @@ def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Traini
         training = build_training(cfg, {})
         assert isinstance(training, NetworkTraining)
         return tuple(build(cfg, "prerequisite").trainings(config, training))
-    if getattr(chosen(cfg, "memory"), "codes", "") != "frozen":
+    if getattr(find_chosen_settings(cfg, "memory"), "codes", "") != "frozen":
         return ()
     optim = partial(build_vqvae_optim, cfg)
     return (VQVAETraining(seed=cfg.vqvae.seed, optim=optim, mirror=cfg.data.mirror),)
@@ -127,7 +127,7 @@ def build_loggers(cfg: DictConfig) -> Loggers:
     outputs = Path(cfg.paths.outputs)
     nodes = _plain(cfg.loggers)
     return Loggers(
-        tuple(find("loggers", name).build(nodes[name], outputs=outputs) for name in nodes), outputs
+        tuple(find_component("loggers", name).build(nodes[name], outputs=outputs) for name in nodes), outputs
     )
 
 
@@ -146,7 +146,7 @@ def build(cfg: DictConfig, slot: str) -> Any:
 
 def _chosen(cfg: DictConfig, slot: str) -> tuple[Component, dict[str, Any]]:
     keys = _plain(cfg[slot])
-    return find(slot, keys["name"]), keys
+    return find_component(slot, keys["name"]), keys
 
 
 def _settings(cfg: DictConfig, slot: str) -> Any:
@@ -161,7 +161,7 @@ def _plain(node: DictConfig) -> dict[str, Any]:
 def build_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config, which makes and loads the network."""
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SHAPE})
-    coordinates = find("coordinates", cfg.normalizer.coordinates).kind()
+    coordinates = find_component("coordinates", cfg.normalizer.coordinates).kind()
     refiner = _settings(cfg, "refiner") if cfg.refiner is not None else None
     build_network, codes = _network(cfg, vqvae)
     return Architecture(
@@ -178,7 +178,7 @@ def build_architecture(cfg: DictConfig) -> Architecture:
 def _network(
     cfg: DictConfig, vqvae: Callable[[], VQVAE]
 ) -> tuple[Callable[[Normalizer, VQVAE | None], MotionModel], str]:
-    network, settings = find("model", cfg.model.name).kind, _settings(cfg, "model")
+    network, settings = find_component("model", cfg.model.name).kind, _settings(cfg, "model")
     if cfg.memory is None:
         return lambda normalizer, codes: network(normalizer, settings), ""
     memory, memory_keys = _chosen(cfg, "memory")
@@ -196,7 +196,7 @@ def _network(
 
 def build_metrics(names: Iterable[str]) -> dict[str, UserMetric]:
     """Return the custom metrics with these names."""
-    own: dict[str, Any] = {name: find("metric", name) for name in names}
+    own: dict[str, Any] = {name: find_component("metric", name) for name in names}
     return {name: UserMetric(metric.kind, metric.settings.of) for name, metric in own.items()}
 
 
@@ -215,7 +215,7 @@ def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
             raise InputError(f"term={cfg.term.name}: must be null with loss={cfg.loss.name}, a complete loss")
         return lambda branches: loss
     term = build(cfg, "term") if cfg.term is not None else Term()
-    branches = find("predictor", cfg.predictor.name).kind.branches  # type: ignore[attr-defined]
+    branches = find_component("predictor", cfg.predictor.name).kind.branches  # type: ignore[attr-defined]
     if cfg.term is not None and term.branch not in branches:
         raise InputError(
             f"term={cfg.term.name}: must compare a branch of predictor={cfg.predictor.name}: "

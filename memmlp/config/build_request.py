@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.common.components import Component, component, find
+from memmlp.common.components import Component, component, find_component
 from memmlp.common.errors import InputError
 from memmlp.common.settings import Settings, at_least, positive, setting
 from memmlp.config import plugins
@@ -43,7 +43,7 @@ def build_motion(cfg: DictConfig) -> MotionSource:
     generate: Callable[[Path], object] | None = None
     if data.synth is not None:
         settings = {str(key): value for key, value in data.synth.items() if key != "name"}
-        generator = find("generator", data.synth.name)
+        generator = find_component("generator", data.synth.name)
         made = "-".join([generator.name, *(f"{key}{value}" for key, value in settings.items())])
         if generator.name == "puppet":
             made = f"{data.synth.minutes:g}min-seed{data.synth.seed}"

@@ -20,7 +20,7 @@ from omegaconf.errors import (
     ValidationError,
 )
 
-from memmlp.common.components import SLOTS, chosen
+from memmlp.common.components import SLOTS, find_chosen_settings
 from memmlp.common.errors import InputError
 from memmlp.config.schema import Config
 
@@ -39,7 +39,7 @@ def check(cfg: DictConfig) -> None:
             shown = list(value) if OmegaConf.is_list(value) else value
             raise InputError(f"{name}={shown}: must be {rule.words}")
     for slot in SLOTS:
-        for problem in settings.problems(cfg) if (settings := chosen(cfg, slot)) else ():
+        for problem in settings.problems(cfg) if (settings := find_chosen_settings(cfg, slot)) else ():
             raise InputError(problem)
     for problem in _problems(cfg):
         raise InputError(problem)

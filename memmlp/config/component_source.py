@@ -9,7 +9,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.common.components import SLOTS, collect_attribute, find, names
+from memmlp.common.components import SLOTS, collect_attribute, find_component, list_component_names
 from memmlp.common.settings import SIZES
 from memmlp.config.schema import ONLY, SCHEMAS
 
@@ -58,14 +58,20 @@ class ComponentSource(ConfigSource):
         group = config_path.strip("/")
         if results_filter == ObjectType.GROUP:
             return []
-        return sorted(SCHEMAS) if group == SCHEMA else ["default"] if group in ONLY else names(group)
+        return (
+            sorted(SCHEMAS)
+            if group == SCHEMA
+            else ["default"]
+            if group in ONLY
+            else list_component_names(group)
+        )
 
 
 def _option(group: str, name: str) -> tuple[str | None, DictConfig]:
     """Return the package of an option, None for its group's own, and its config."""
     if group in (SCHEMA, *ONLY):
         return None, OmegaConf.structured(SCHEMAS[name] if group == SCHEMA else ONLY[group])
-    settings = find(group, name).settings
+    settings = find_component(group, name).settings
     node: Any = OmegaConf.structured(settings)
     if group == "loggers":
         return f"loggers.{name}", node

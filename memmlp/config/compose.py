@@ -24,9 +24,9 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from memmlp.common.components import SLOTS, collect_attribute, declared, names
+from memmlp.common.components import SLOTS, collect_attribute, collect_components, list_component_names
 from memmlp.common.errors import InputError
-from memmlp.common.overrides import Override, last_by_key, parse_overrides
+from memmlp.common.overrides import Override, parse_overrides, select_last_by_key
 from memmlp.common.settings import Settings
 from memmlp.config import plugins
 from memmlp.config.check import check, explain, unknown_key
@@ -226,13 +226,13 @@ def _with_components(options: Sequence[str]) -> DictConfig | None:
     Returns:
         The config that Hydra would compose; None for options that only Hydra can combine.
     """
-    chosen = last_by_key(options)
+    chosen = select_last_by_key(options)
     special = any(override.signs or len(override.options) != 1 for override in chosen.values())
     if special or EXPERIMENT in chosen:
         return None
     cfg: DictConfig = pickle.loads(_with_options(*(o.text for key, o in chosen.items() if key not in SLOTS)))
     names = {key: override.options[0] for key, override in chosen.items() if key in SLOTS}
-    model = declared().get(("model", names.get("model") or cfg.model.name))
+    model = collect_components().get(("model", names.get("model") or cfg.model.name))
     if model is None or _brings_more("model", cfg.model.name):
         return None
     for slot, name in {**collect_attribute(model.settings, "defaults"), **names}.items():
@@ -248,7 +248,7 @@ def _with_components(options: Sequence[str]) -> DictConfig | None:
 
 
 def _brings_more(slot: str, name: str) -> bool:
-    kind = found.settings if (found := declared().get((slot, name))) else Settings
+    kind = found.settings if (found := collect_components().get((slot, name))) else Settings
     return any(collect_attribute(kind, attribute) for attribute in ("defaults", "recipe"))
 
 
@@ -256,7 +256,7 @@ def _make_node(slot: str, name: str) -> DictConfig | None:
     """Return a component's typed keys, with those of a YAML file if the option is one; None if Hydra must."""
     path = packaged("conf") / slot / f"{name}.yaml"
     if not path.is_file():
-        found = declared().get((slot, name))
+        found = collect_components().get((slot, name))
         return OmegaConf.structured(found.settings) if found else None
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     match content.pop("defaults", None):
@@ -327,7 +327,7 @@ def help_text(args: argparse.Namespace) -> str:
         for path in sorted(folder.rglob("*.yaml")):
             options.setdefault(path.parent.relative_to(folder).as_posix(), []).append(path.stem)
     for group in (*GROUPS, *ONLY):
-        options.setdefault(group, []).extend(["default"] if group in ONLY else names(group))
+        options.setdefault(group, []).extend(["default"] if group in ONLY else list_component_names(group))
     groups = [
         f"{name}: {', '.join(sorted(options[name]))}"
         for name in sorted(options.keys() - {".", "search"})

@@ -12,12 +12,12 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from memmlp.common.components import SLOTS, declared
-from memmlp.common.overrides import value_text
+from memmlp.common.components import SLOTS, collect_components
+from memmlp.common.overrides import format_value
 from memmlp.config.component_source import register
 from memmlp.config.compose import VERSION_BASE
 from memmlp.config.plugins import packaged
-from memmlp.runs.identity import NETWORK, flatten, option_in_slot, training_config
+from memmlp.runs.identity import NETWORK, find_option, flatten, select_training_config
 from memmlp.runs.lookup import describe_kind
 
 MAX_WORDS = 6
@@ -54,30 +54,30 @@ def _differences(config: Mapping[str, Any]) -> Iterator[str]:
         sizes = f"profile={profile['sizes']}"
         usual = _default((sizes,))["profile"]
         changed = [key for key in profile if key not in SET_BY_MODELS and profile[key] != usual.get(key)]
-        chosen = [sizes, *(f"profile.{key}={value_text(profile[key])}" for key in changed)]
+        chosen = [sizes, *(f"profile.{key}={format_value(profile[key])}" for key in changed)]
         yield from chosen[profile["sizes"] == "small" :]
     named = [slot for slot in SLOTS if slot in config and (config[slot] is None or "name" in config[slot])]
-    options = {slot: option_in_slot(config, slot) for slot in named}
+    options = {slot: find_option(config, slot) for slot in named}
     custom = [slot for slot, option in options.items() if option and not _is_shipped(slot, option)]
     for slots in (["model"], [slot for slot in options if slot != "model"]):  # a model brings other options
         default = _default(tuple(chosen))
-        changed = [
-            slot for slot in slots if slot in options and options[slot] != option_in_slot(default, slot)
-        ]
+        changed = [slot for slot in slots if slot in options and options[slot] != find_option(default, slot)]
         yield from (f"{slot}={options[slot] or 'none'}" for slot in changed)
         chosen += [f"{slot}={options[slot] or 'null'}" for slot in changed if slot not in custom]
     default = _default(tuple(chosen))
     own, usual = flatten(config), {"data.drawn_by": "frames", "data.mirror": False} | flatten(default)
-    for key in training_config(config) | training_config(default):  # either may count it where it is set
+    for key in select_training_config(config) | select_training_config(
+        default
+    ):  # either may count it where it is set
         group, _, last = key.partition(".")
         if group in (*custom, "profile") or last == "name" or key in ("seed", "vqvae.seed"):
             continue
         if key in own and own[key] != usual.get(key):
-            yield f"{key}={value_text(own[key])}"
+            yield f"{key}={format_value(own[key])}"
 
 
 def _is_shipped(slot: str, option: str) -> bool:
-    found = declared().get((slot, option))
+    found = collect_components().get((slot, option))
     return found is not None and found.package == "memmlp"
 
 

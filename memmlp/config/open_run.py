@@ -18,7 +18,7 @@ from memmlp.config.build import build_experiment, config_of
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.motion_model import MotionModel
-from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, training_config
+from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, select_training_config
 from memmlp.runs.lookup import find_run
 from memmlp.runs.run import Run
 from memmlp.training.devices import device
@@ -82,7 +82,7 @@ def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] =
     experiment = replace(
         build_experiment(config_of(run, overrides), elsewhere=True), device=device(device_name)
     )
-    if training_config(run.config) != training_config(experiment.config):
+    if select_training_config(run.config) != select_training_config(experiment.config):
         words = ", ".join(overrides)
         raise InputError(f"{words}: changes the training; set keys of evaluation and export only")
     for word in parse_overrides(overrides):

@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 
 import memmlp
-from memmlp.common.components import SLOTS, Component, add_package, declared, find
+from memmlp.common.components import SLOTS, Component, add_package, collect_components, find_component
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import parse_overrides
 from memmlp.common.settings import MetricSettings
@@ -108,7 +108,7 @@ def _use(name: str) -> None:
     root = _root(name)
     try:
         add_package(name, root)
-        for (slot, option), one in declared().items():
+        for (slot, option), one in collect_components().items():
             if one.package == name and slot == "metric":
                 _add_metric(option, one)
         for fault in _hidden(root):
@@ -160,7 +160,7 @@ def _hidden(root: Path) -> Iterator[str]:
 
 def is_component(option: Path) -> bool:
     """Return whether memmlp has a component with the group and the name of a config file."""
-    found = declared().get((option.parent.as_posix(), option.stem))
+    found = collect_components().get((option.parent.as_posix(), option.stem))
     return found is not None and found.package == "memmlp"
 
 
@@ -172,7 +172,7 @@ def find_used(config: Mapping[str, Any]) -> list[str]:
     if config["data"].get("synth"):
         options.append(("generator", config["data"]["synth"]["name"]))
     options += [("loggers", name) for name in config.get("loggers") or ()]
-    return sorted({find(slot, name).package for slot, name in options} - {"memmlp"})
+    return sorted({find_component(slot, name).package for slot, name in options} - {"memmlp"})
 
 
 def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where: str) -> None:

@@ -8,16 +8,16 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.common.components import SLOTS, find, names
+from memmlp.common.components import SLOTS, find_component, list_component_names
 from memmlp.common.settings import (
     DEVICE,
     SIZES,
     Rule,
     Settings,
     at_least,
-    clip_folders,
     each,
     existing,
+    existing_clip_folders,
     fraction,
     group,
     one_of,
@@ -115,7 +115,7 @@ class SourceConfig:
 
 @dataclass
 class SeededDataConfig(DataConfig):
-    root: Any = setting(clip_folders())
+    root: Any = setting(existing_clip_folders())
     sources: dict[str, SourceConfig] = field(default_factory=dict)
     synth: Settings | None = None
     split: SeededSplitConfig = group(SeededSplitConfig)
@@ -180,7 +180,7 @@ class ProfileConfig:
 
 def _coordinates() -> Rule:
     words = "heading or head_relative or world, or coordinates that a plugin declares"
-    return Rule(words, lambda value: value in names("coordinates"))
+    return Rule(words, lambda value: value in list_component_names("coordinates"))
 
 
 @dataclass
@@ -226,7 +226,7 @@ class VQVAEConfig:
 
 def _metrics() -> Rule:
     words = "one of the metrics that plugins=[NAME] declare"
-    return Rule(words, lambda value: value in names("metric"))
+    return Rule(words, lambda value: value in list_component_names("metric"))
 
 
 @dataclass
@@ -325,13 +325,17 @@ def restored(config: Mapping[str, Any]) -> DictConfig:
         if not isinstance(content, Mapping):
             cfg[key] = content
         elif key == "loggers":
-            cfg.loggers = {name: _typed(find(key, name).settings, node) for name, node in content.items()}
+            cfg.loggers = {
+                name: _typed(find_component(key, name).settings, node) for name, node in content.items()
+            }
         elif key == "data":
             synth = content.get("synth")
             cfg.data = _typed(_data_schema(content), {**content, "synth": None})
-            cfg.data.synth = _typed(find("generator", synth["name"]).settings, synth) if synth else None
+            cfg.data.synth = (
+                _typed(find_component("generator", synth["name"]).settings, synth) if synth else None
+            )
         elif key in SLOTS:
-            cfg[key] = _typed(find(key, content["name"]).settings, content)
+            cfg[key] = _typed(find_component(key, content["name"]).settings, content)
         else:
             cfg[key] = OmegaConf.merge(cfg[key], content)
     return cfg

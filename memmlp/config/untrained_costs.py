@@ -13,7 +13,7 @@ from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import Measured, measure_untrained
-from memmlp.runs.environment import environment
+from memmlp.runs.environment import describe_environment
 from memmlp.sweep.definition import COSTS, SIZES, Sweep
 
 
@@ -73,4 +73,4 @@ def measure_costs(overrides: tuple[str, ...], timed: bool) -> Measured:
         record = size(model, network, path)
         if timed:
             record |= deployment.times(model, path) | measure_pose(path, deployment.latency_steps)
-    return measure_untrained(overrides, record, environment() | {"device": "cpu", "body": "builtin"})
+    return measure_untrained(overrides, record, describe_environment() | {"device": "cpu", "body": "builtin"})

@@ -23,7 +23,7 @@ from onnxscript.optimizer import fold_constants
 from torch import Tensor, nn
 
 from memmlp import __version__
-from memmlp.common.lease import publish, temporary
+from memmlp.common.lease import publish, temporary_path
 from memmlp.deploy.opsets import NATIVE, convert
 from memmlp.deploy.parity import deterministic
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
@@ -104,7 +104,7 @@ def save(
         simplify(program.model)
     graph = convert(program.model_proto, opset)
     onnx.helper.set_model_props(graph, meta)
-    unfinished = temporary(path)
+    unfinished = temporary_path(path)
     try:
         onnx.save(graph, unfinished)
         publish(unfinished, path)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.backends import mha
 from torch.utils.flop_counter import FlopCounterMode, flop_registry, shape_wrapper
 
-from memmlp.common.processes import CoreClock
+from memmlp.common.processes import CoreUsageTimer
 from memmlp.deploy.onnx_stream import OnnxStream, start_session
 from memmlp.motion.body import MOTION_DIM, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Change, Normalizer
@@ -56,7 +56,7 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
     ours, theirs = [], []
     for step in range(WARM_UP + max(steps, 200)):
         if step == WARM_UP:
-            clock = CoreClock()
+            clock = CoreUsageTimer()
         start = time.perf_counter()
         stream.step(sparse)
         middle = time.perf_counter()
@@ -110,7 +110,7 @@ def in_turn(keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.nda
     shares: dict[Key, list[float]] = {key: [] for key in order}
     for _ in range(rounds):
         for key in order:
-            clock = CoreClock()
+            clock = CoreUsageTimer()
             seconds[key].append(time_round(key))
             shares[key].append(clock.fraction)
         order.reverse()

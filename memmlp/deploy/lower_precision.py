@@ -20,7 +20,7 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
-from memmlp.common.lease import publish, temporary
+from memmlp.common.lease import publish, temporary_path
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import Constants
@@ -30,7 +30,7 @@ from memmlp.evaluation.modes import joint_positions, rotations_report
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import StreamingGraph
-from memmlp.runs.deployment_folder import accurate_enough
+from memmlp.runs.deployment_folder import is_accurate_enough
 
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
 TEST_FRAMES = 20_000  # accuracy is measured on at most this many
@@ -116,7 +116,7 @@ def _quantise(source: Path, path: Path, inner: list[str], clips: Sequence[Tensor
     Weights get one scale for each output, and seven bits: with eight bits, CPUs without VNNI overflow, since
     they add products in sixteen bits. Activations get eight bits and one scale, found by streaming clips.
     """
-    unfinished, root = temporary(path), logging.getLogger()
+    unfinished, root = temporary_path(path), logging.getLogger()
     level = root.level
     root.setLevel(logging.ERROR)  # it advises to prepare the graph, which torch's exporter has done already
     try:
@@ -257,10 +257,10 @@ def compare_accuracy(
 
     Returns:
         The metrics of both files, the relative growth of MPJPE, of the branch in which that is larger, and of
-        Jitter, and whether the other file may be the default (`accurate_enough`).
+        Jitter, and whether the other file may be the default (`is_accurate_enough`).
     """
     before, after = (measure_accuracy(path, normalizer, clips) for path in (exact, other))
     growths = {name: after[name] / before[name] - 1 for name in ("MPJPE", "position MPJPE", "Jitter")}
     jitter = growths.pop("Jitter")
     grown = {"growth": float(np.max(list(growths.values()))), "jitter_growth": jitter}  # NaN if either is
-    return {"fp32": before, precision: after, **grown, "default": accurate_enough(grown)}
+    return {"fp32": before, precision: after, **grown, "default": is_accurate_enough(grown)}

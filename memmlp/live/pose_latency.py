@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from memmlp.common.processes import CoreClock
+from memmlp.common.processes import CoreUsageTimer
 from memmlp.deploy.latency import SETTLING, WARM_UP, InTurn, in_turn
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
@@ -26,7 +26,7 @@ def measure_pose(path: Path, steps: int) -> dict[str, float]:
     pose may take less time than its step does there. `pose_core_share` is the share of that time in which the
     thread had a core.
     """
-    stream, clock = Stream(path), CoreClock()
+    stream, clock = Stream(path), CoreUsageTimer()
     seconds = time_poses(stream, WARM_UP + max(steps, LEAST))[WARM_UP:]
     return {
         "pose_median_ms": 1000 * float(np.median(seconds)),

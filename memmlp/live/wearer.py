@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.common.errors import InputError, why_unreadable
+from memmlp.common.errors import InputError, describe_read_error
 from memmlp.common.files import write_json
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SpaceName, space_of
@@ -184,7 +184,7 @@ def read_calibration(path: Path, space: SpaceName, body: BodyTree) -> Calibratio
         with open(path, "rb") as file:
             fields = json.loads(file.read(LARGEST))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not a calibration ({why_unreadable(error)}); {MADE}") from None
+        raise InputError(f"{path}: is not a calibration ({describe_read_error(error)}); {MADE}") from None
     if not isinstance(fields, dict) or fields.get("memmlp") != "calibration":
         raise InputError(f"{path}: is not a calibration; {MADE}")
     if fields.get("space") != space_of(space).name:

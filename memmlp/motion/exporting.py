@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from memmlp.common.errors import InputError, one_line
+from memmlp.common.errors import InputError, escape_line_breaks
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import check_imported_body, load_rest_joints
 from memmlp.motion.clip import Clip, Skipped, resample
@@ -230,7 +230,7 @@ def export_converted(
                 no_motion = isinstance(error, NoMotion)  # AMASS has files of shapes beside its clips
                 if single or (strict and not no_motion):
                     raise
-                reason = str(error).removeprefix(one_line(f"{target.source}: "))
+                reason = str(error).removeprefix(escape_line_breaks(f"{target.source}: "))
                 skipped.extend([] if no_motion else [Skipped(target.name + target.source.suffix, reason)])
                 continue
             faults.update({target.name: clip_faults} if clip_faults else {})

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.common.lease import Lock, publish, temporary
+from memmlp.common.lease import Lock, publish, temporary_path
 from memmlp.motion.preparing.cache import ClipFolder, finished_cache, prepare
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
 from memmlp.motion.preparing.manifest import Coverage, Manifest
@@ -116,6 +116,6 @@ def _make_once(root: Path, generate: Callable[[Path], object]) -> None:
     root.parent.mkdir(parents=True, exist_ok=True)
     with Lock(root.parent, root.name).hold():
         if not root.exists():  # no other process made it while this one waited
-            unfinished = temporary(root)
+            unfinished = temporary_path(root)
             generate(unfinished)
             publish(unfinished, root)

@@ -102,7 +102,7 @@ class Dropout(nn.Dropout):
 
     def forward(self, h: Tensor) -> Tensor:
         """Set random elements of features (B, ...) to 0 in training, and scale the others up."""
-        if not (self.training and distributed.is_shared()):
+        if not (self.training and distributed.is_batch_split()):
             return super().forward(h)
         return h * distributed.draw_rows(lambda like: F.dropout(torch.ones_like(like), self.p), h)
 

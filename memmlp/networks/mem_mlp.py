@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common.components import chosen, component
+from memmlp.common.components import component, find_chosen_settings
 from memmlp.common.settings import Settings, at_least, setting
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
@@ -185,7 +185,7 @@ class MemMLPSettings(Settings):
         layers = list(memory.get("layers", []))
         if layers and max(layers) > model["depth"]:
             yield f"memory.layers={layers}: must be at most model.depth={model['depth']}"
-        loss, predictor = chosen(config, "loss"), chosen(config, "predictor")
+        loss, predictor = find_chosen_settings(config, "loss"), find_chosen_settings(config, "predictor")
         if getattr(loss, "complete", False):
             name, alone = config["loss"]["name"], "predictor=rotation_only hand=off"
             if not getattr(loss, "rotations_alone", False):

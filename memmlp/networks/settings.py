@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from memmlp.common.components import chosen
+from memmlp.common.components import find_chosen_settings
 from memmlp.common.settings import Settings, at_least, setting
 
 
@@ -42,7 +42,7 @@ class NetworkSettings(Settings):
         loss, rollout = config["loss"]["name"], config["rollout"]["name"]
         if loss == "of_network" and not cls.trains_by_itself:
             yield f"loss=of_network: must be another loss, since model={name} has no loss of its own"
-        if not getattr(chosen(config, "loss"), "complete", False):
+        if not getattr(find_chosen_settings(config, "loss"), "complete", False):
             yield f"loss={loss}: must be a complete loss, such as the default of model={name}"
         if rollout not in ("teacher_forcing", *(["streams"] if cls.carries_state else [])):
             yield f"rollout={rollout}: must be teacher_forcing with model={name}"

@@ -101,7 +101,7 @@ class EMACodebook(Codebook):
         self.sums.lerp_(chosen.T @ latent, 1 - self.decay)
         self._restart(self.counts < self.DEAD, latent)
         self.vectors.copy_(self.sums / self.counts[:, None])
-        return distributed.local_rows(codes), distributed.local_rows(index)
+        return distributed.take_local_rows(codes), distributed.take_local_rows(index)
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
         """Replace the codes that are `dead` (K,) by random latents of the batch (B, width)."""

@@ -18,14 +18,14 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write, plain
+from memmlp.common.files import atomic_write, make_json_safe
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import Errors, Measured, Origin
 from memmlp.sweep.definition import Sweep
 
 DIGITS = 6
 FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string contains a line break
-DEFAULT_ORIGIN = plain(asdict(Origin(code="", changed=False, data="", hardware="")))
+DEFAULT_ORIGIN = make_json_safe(asdict(Origin(code="", changed=False, data="", hardware="")))
 REQUIRED = ("code", "changed", "data", "hardware")  # facts of an origin that a file always has
 
 
@@ -211,7 +211,7 @@ def _record(run: Measured) -> dict[str, Any]:
     names = list(run.clips)
     origin = {
         key: value
-        for key, value in plain(asdict(run.origin)).items()
+        for key, value in make_json_safe(asdict(run.origin)).items()
         if key in REQUIRED or value != DEFAULT_ORIGIN[key]
     }
     errors = {

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from memmlp.common.errors import InputError, require
+from memmlp.common.errors import InputError, import_optional
 from memmlp.report.kept_results import Kept
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
@@ -71,7 +71,7 @@ def make_pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -
 
 def _fill(name: str, text: str, placeholders: Mapping[str, object]) -> str:
     """Return a page: its template, filled in. Raises InputError, which names the template."""
-    jinja2 = require("jinja2", "plots", name)
+    jinja2 = import_optional("jinja2", "plots", name)
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined, keep_trailing_newline=True, trim_blocks=True
     )

@@ -86,7 +86,7 @@ def import_run(
     try:
         with zipfile.ZipFile(path) as archive:
             run_id, names = _check_names(archive, path, max_size)
-            run, new = _place(archive, path, run_id, outputs)
+            run, new = _move_to_runs(archive, path, run_id, outputs)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
         raise InputError(f"{path}: must be an archive of a run ({error})") from None
     missing = (name for name in names if "/" in name and not (run.folder / name).exists())
@@ -112,7 +112,7 @@ def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> tuple[s
     return run_id, [name.partition("/")[2] for name in every]
 
 
-def _place(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Path) -> tuple[Run, bool]:
+def _move_to_runs(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Path) -> tuple[Run, bool]:
     """Unpack a run into a temporary folder, check it, and move it to the outputs folder."""
     place = Run.from_id(outputs, run_id)
     place.folder.parent.mkdir(parents=True, exist_ok=True)
@@ -120,7 +120,7 @@ def _place(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Path) -> 
     try:
         archive.extractall(staging)
         run = Run(staging / run_id)
-        _check(run, path)
+        _check_unpacked_run(run, path)
         if not place.folder.exists():
             os.rename(run.folder, place.folder)
             sync_folder(place.folder.parent)
@@ -133,7 +133,7 @@ def _place(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Path) -> 
         shutil.rmtree(staging, ignore_errors=True)
 
 
-def _check(run: Run, path: Path) -> None:
+def _check_unpacked_run(run: Run, path: Path) -> None:
     """Raise InputError if the unpacked files are not a finished, unchanged run."""
     if not run.done or run.manifest.get("id") != run.id or not run.config:
         raise InputError(f"{path}: must contain a finished run {run.id}")

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.files import file_digest, now, read_json, write_json
-from memmlp.runs.environment import environment
-from memmlp.runs.identity import belongs, deployment_id_of, deployment_versions
+from memmlp.runs.environment import describe_environment
+from memmlp.runs.identity import belongs_to_folder, find_deployment_versions, hash_deployment_settings
 
 ONNX_FILES = {
     "fp32": "step.onnx",
@@ -54,23 +54,25 @@ class DeploymentFolder:
         """Whether the deployment is complete and belongs to the run in whose folder it is."""
         record = self.record
         whole = all((self.folder / name).is_file() for name in record.get("artifacts", {}))
-        return bool(record) and whole and belongs(record.get("run"), self.folder.parent.parent)
+        return bool(record) and whole and belongs_to_folder(record.get("run"), self.folder.parent.parent)
 
     @property
     def is_current(self) -> bool:
         """Whether the deployment was made with the current component versions."""
-        return self.folder.name == deployment_id_of(self.settings)
+        return self.folder.name == hash_deployment_settings(self.settings)
 
     @property
     def component_versions(self) -> dict[str, int]:
         """The component versions of the deployment; empty if some of them are outdated."""
-        return deployment_versions(self.settings) if self.is_current else {}
+        return find_deployment_versions(self.settings) if self.is_current else {}
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write the measurements and the files' digests; this marks the deployment as complete."""
         files = map(self.onnx_path, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}
-        write_json(self.latency, {**record, "made": now(), "made_by": environment(), "artifacts": artifacts})
+        write_json(
+            self.latency, {**record, "made": now(), "made_by": describe_environment(), "artifacts": artifacts}
+        )
 
     @property
     def record(self) -> dict[str, Any]:
@@ -91,11 +93,11 @@ class DeploymentFolder:
     def accurate_int8_file(self) -> Path | None:
         """An existing int8 ONNX file that is accurate enough to replace float32; None without one."""
         record = self.record
-        accurate = [name for name in INT8_PRECISIONS if accurate_enough(record.get(name, {}))]
+        accurate = [name for name in INT8_PRECISIONS if is_accurate_enough(record.get(name, {}))]
         return next((self.onnx_path(name) for name in accurate if self.onnx_path(name).exists()), None)
 
 
-def accurate_enough(cost: Mapping[str, Any]) -> bool:
+def is_accurate_enough(cost: Mapping[str, Any]) -> bool:
     """Return whether a lower precision is accurate enough to replace float32.
 
     Args:
@@ -106,22 +108,22 @@ def accurate_enough(cost: Mapping[str, Any]) -> bool:
     return growth <= MAX_GROWTH and jitter <= MAX_JITTER_GROWTH
 
 
-def deployed_precision(latency: Mapping[str, Any]) -> str:
+def find_deployed_precision(latency: Mapping[str, Any]) -> str:
     """Return the requested precision of a deployment if it was exported; otherwise "fp32"."""
     precision = str((latency.get("settings") or {}).get("precision", "fp32"))
     return precision if precision in latency else "fp32"
 
 
-def as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
+def select_deployed_measurements(latency: Mapping[str, Any]) -> dict[str, Any]:
     """Return a deployment's measurements, with size and times of the requested precision at the top level."""
-    return {**latency, **latency.get(deployed_precision(latency), {})}
+    return {**latency, **latency.get(find_deployed_precision(latency), {})}
 
 
-def with_times_as_deployed(results: Mapping[str, Any]) -> dict[str, Any]:
+def replace_with_deployed_times(results: Mapping[str, Any]) -> dict[str, Any]:
     """Return a run's results with each deployment's numbers replaced by those of the requested precision."""
 
     def merge(latency: Mapping[str, Any]) -> dict[str, Any]:
-        deployed = as_deployed(latency)
+        deployed = select_deployed_measurements(latency)
         return {
             key: deployed[key] if isinstance(value, int | float) else value for key, value in latency.items()
         }
@@ -132,7 +134,7 @@ def with_times_as_deployed(results: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def timed_on(record: Mapping[str, Any]) -> str:
+def describe_timing_machine(record: Mapping[str, Any]) -> str:
     """Return the processor and ONNX Runtime version of a deployment's measurements; "?" if unknown."""
     made_by = record.get("made_by") or {}
     runtime = (made_by.get("packages") or {}).get("onnxruntime")

@@ -32,27 +32,27 @@ NOT_USERS = ("memmlp", "torch", "numpy", *sys.stdlib_module_names)
 """Modules that never belong to the user, whatever their path."""
 
 
-def environment() -> dict[str, Any]:
+def describe_environment() -> dict[str, Any]:
     """Describe the code, packages and hardware; the machine's name appears only as a digest."""
     packages = ("torch", "numpy", "onnxruntime")
     return {
         "version": memmlp.__version__,
-        "git": _git(),
+        "git": _describe_commit(),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in packages},
+        "packages": {name: _find_installed_version(name) for name in packages},
         "platform": platform.platform(),
-        "cpu": _cpu(),
+        "cpu": _describe_cpu(),
         "cores": os.cpu_count(),
-        "host": host(),
+        "host": hash_host_name(),
     }
 
 
-def host() -> str:
+def hash_host_name() -> str:
     """Return a digest of the machine's name, 12 hex digits."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:12]
 
 
-def _version(package: str) -> str | None:
+def _find_installed_version(package: str) -> str | None:
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -60,84 +60,86 @@ def _version(package: str) -> str | None:
 
 
 @functools.cache
-def _git() -> dict[str, Any] | None:
+def _describe_commit() -> dict[str, Any] | None:
     """Return the commit of the package and whether its files were modified; None outside a git checkout."""
     try:
-        _in_git("ls-files", "--error-unmatch", "__init__.py")
-        commit = _in_git("rev-parse", "HEAD")
-        return {"commit": commit, "dirty": bool(_in_git("status", "--porcelain", "--", "."))}
+        _run_git("ls-files", "--error-unmatch", "__init__.py")
+        commit = _run_git("rev-parse", "HEAD")
+        return {"commit": commit, "dirty": bool(_run_git("status", "--porcelain", "--", "."))}
     except (OSError, subprocess.SubprocessError):
         return None
 
 
-def _in_git(*args: str) -> str:
+def _run_git(*args: str) -> str:
     command = ["git", "-C", str(PACKAGE), *args]
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
 
 
 @functools.cache
-def changes() -> str:
+def create_code_patch() -> str:
     """Return a patch from the package's commit to the code of this process, and the names of untracked files.
 
     The patch is empty without modifications or outside a git checkout. It is created once for each process,
     since the process does not run later edits.
     """
-    git = _git()
+    git = _describe_commit()
     if not git or not git["dirty"]:
         return ""
     with contextlib.suppress(OSError, subprocess.SubprocessError):
-        new = _in_git("ls-files", "--others", "--exclude-standard", "--", ".")
+        new = _run_git("ls-files", "--others", "--exclude-standard", "--", ".")
         header = "".join(f"# not in the commit: {name}\n" for name in new.splitlines())
-        return (header + _in_git("diff", "HEAD", "--", ".") + "\n")[:PATCH]
+        return (header + _run_git("diff", "HEAD", "--", ".") + "\n")[:PATCH]
     return ""
 
 
-def code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
+def compute_code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
     """Return a code digest for each file that affects the numbers of a run.
 
     Comments and docstrings are ignored. Files of users' packages are named PACKAGE:FILE.
     """
-    return {name: code_digest(content) for name, content in code_files(packages).items()}
+    return {name: compute_code_digest(content) for name, content in read_code_files(packages).items()}
 
 
-def code_files(packages: Iterable[str] = ()) -> dict[str, bytes]:
+def read_code_files(packages: Iterable[str] = ()) -> dict[str, bytes]:
     """Return the content of each file that affects the numbers of a run, as this process runs it."""
-    users = _user_files(packages).items()
-    return _package_code() | {f"{name}:{file}": code for name, files in users for file, code in files.items()}
+    users = _read_user_files(packages).items()
+    return _read_package_code() | {
+        f"{name}:{file}": code for name, files in users for file, code in files.items()
+    }
 
 
 def describe_sources(packages: Iterable[str] = ()) -> dict[str, dict[str, str]]:
     """Return the manifest entries about the code: digests of each file's code and of its bytes."""
-    files = code_files(packages)
+    files = read_code_files(packages)
     return {
-        "sources": {name: code_digest(content) for name, content in files.items()},
-        "source_bytes": {name: byte_digest(content) for name, content in files.items()},
+        "sources": {name: compute_code_digest(content) for name, content in files.items()},
+        "source_bytes": {name: compute_byte_digest(content) for name, content in files.items()},
     }
 
 
-def byte_digest(content: bytes) -> str:
+def compute_byte_digest(content: bytes) -> str:
     """Return a digest of a file's content, 12 hex digits."""
     return hashlib.sha256(content).hexdigest()[:12]
 
 
-def changed_since(manifest: Mapping[str, Any]) -> list[str]:
-    """Return the files that have changed since a run with this manifest began (`changed`).
+def list_changed_files(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the files that have changed since a run with this manifest began (`list_differing_files`).
 
     Only files with different bytes are parsed, since parsing all files takes half a second.
     """
     before, unread = manifest.get("sources", {}), manifest.get("source_bytes", {})
-    files = code_files(manifest.get("plugins", ())) if before else {}
+    files = read_code_files(manifest.get("plugins", ())) if before else {}
     return sorted(
         name
         for name, content in files.items()
         if name in before
-        and (before[name] == MIXED or unread.get(name) != byte_digest(content))
-        and before[name] != code_digest(content)
+        and (before[name] == MIXED or unread.get(name) != compute_byte_digest(content))
+        and before[name] != compute_code_digest(content)
     )
 
 
-def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
-    """Return the files with different digests in two results of `code_digests`.
+def list_differing_files(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
+    """Return the files with different digests in two results of `compute_code_digests`.
 
     Files in only one of them are ignored: new code runs only if other code or the config changed, too.
     """
@@ -145,19 +147,19 @@ def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
 
 
 @functools.cache
-def _package_code() -> dict[str, bytes]:
+def _read_package_code() -> dict[str, bytes]:
     files = {path.relative_to(PACKAGE): path for path in sorted(PACKAGE.rglob("*.py"))}
-    return {name.as_posix(): path.read_bytes() for name, path in files.items() if _counts(name)}
+    return {name.as_posix(): path.read_bytes() for name, path in files.items() if _affects_results(name)}
 
 
-def _counts(path: Path) -> bool:
+def _affects_results(path: Path) -> bool:
     """Return whether a file affects the numbers of a run, given its path relative to the package."""
     unused = path.parts[0].startswith("_") or any(map(path.is_relative_to, NOT_NUMBERS))
     return path.as_posix() in WIRING or not unused
 
 
 @functools.cache
-def code_digest(code: bytes) -> str:
+def compute_code_digest(code: bytes) -> str:
     """Return a digest of Python code (12 hex digits) that ignores layout, comments and docstrings.
 
     If the code can't be parsed, return a digest of its bytes.
@@ -165,52 +167,53 @@ def code_digest(code: bytes) -> str:
     try:
         tree = ast.parse(code.decode())
     except (SyntaxError, ValueError):
-        return byte_digest(code)
+        return compute_byte_digest(code)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
             node.body = node.body[1:] or [ast.Pass()]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
 
 
-def _user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
+def _read_user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
     """Return the content of all Python files in users' packages, by package and file, without imports.
 
     If a package is not found, its entry is empty.
     """
     return {
-        name: {file: _user_code(path) for file, path in _package_files(name).items()} for name in packages
+        name: {file: _read_user_code(path) for file, path in _list_package_files(name).items()}
+        for name in packages
     }
 
 
-def user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
+def describe_user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
     """Return the version and code digest of each user's package, by name."""
     digests = {
-        name: {file: code_digest(code) for file, code in files.items()}
-        for name, files in _user_files(names).items()
+        name: {file: compute_code_digest(code) for file, code in files.items()}
+        for name, files in _read_user_files(names).items()
     }
     return {
-        name: {"version": _user_version(name), "digest": byte_digest(repr(files).encode())}
+        name: {"version": _find_user_version(name), "digest": compute_byte_digest(repr(files).encode())}
         for name, files in digests.items()
     }
 
 
-def _user_version(name: str) -> str | None:
+def _find_user_version(name: str) -> str | None:
     """Return a user package's `__version__`, otherwise the version of the distribution with the package."""
     spec = _find_spec(name)
     text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
     if version := re.search(r'^__version__ = "(.+)"$', text, re.MULTILINE):
         return version[1]
     distributions = metadata.packages_distributions().get(name.split(".")[0], [])
-    return _version(distributions[0]) if distributions else None
+    return _find_installed_version(distributions[0]) if distributions else None
 
 
 @functools.cache
-def _user_code(path: Path) -> bytes:
+def _read_user_code(path: Path) -> bytes:
     """Read a file once for each process, since the process does not run later edits."""
     return path.read_bytes()
 
 
-def _package_files(name: str) -> dict[str, Path]:
+def _list_package_files(name: str) -> dict[str, Path]:
     """Return the Python files of a user's package, by relative path; empty if the package is not found."""
     spec = _find_spec(name)
     if spec is None:
@@ -237,7 +240,7 @@ def _find_spec(name: str) -> ModuleSpec | None:
     return spec
 
 
-def _cpu() -> str:
+def _describe_cpu() -> str:
     with contextlib.suppress(OSError):
         match = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
         if match:
@@ -255,7 +258,7 @@ FACTS = ("component_versions", "git", "version", "sources", "plugins", "packages
 """Manifest keys about a run's code and machine, copied from prerequisite runs."""
 
 
-def prerequisite_origins(manifest: Mapping[str, Any], weights: str | None) -> list[dict[str, Any]]:
+def list_prerequisite_origins(manifest: Mapping[str, Any], weights: str | None) -> list[dict[str, Any]]:
     """Return the origins of all prerequisite runs for a new run, the direct one first.
 
     Each origin has the `id` and `kind` of a run, the SHA-256 of its `weights`, and the known FACTS.
@@ -266,21 +269,21 @@ def prerequisite_origins(manifest: Mapping[str, Any], weights: str | None) -> li
     """
     own = {"id": manifest.get("id"), "kind": manifest.get("kind"), "weights": weights}
     facts = {name: manifest[name] for name in FACTS if name in manifest}
-    return [own | facts, *recorded_prerequisites(manifest)]
+    return [own | facts, *get_recorded_prerequisites(manifest)]
 
 
-def recorded_prerequisites(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
+def get_recorded_prerequisites(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the origins of the prerequisite runs in a run's manifest."""
     return manifest.get(PREREQUISITES) or []
 
 
-def prerequisite_versions(manifest: Mapping[str, Any]) -> dict[str, int]:
+def collect_prerequisite_versions(manifest: Mapping[str, Any]) -> dict[str, int]:
     """Return the component versions of the prerequisite runs in a run's manifest, by component."""
-    every = [one.get("component_versions") or {} for one in recorded_prerequisites(manifest)]
+    every = [one.get("component_versions") or {} for one in get_recorded_prerequisites(manifest)]
     return {name: number for versions in every for name, number in versions.items()}
 
 
-def join_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+def merge_run_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
     """Merge the facts about code and machine before and after a training was resumed.
 
     Different values are both kept. The digest of a changed file is replaced by "mixed". Current prerequisite
@@ -300,7 +303,9 @@ def join_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[st
         other = old.get("before") or (old["commit"] if old["commit"] != new["commit"] else None)
         merged["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
     sources = before.get("sources", after["sources"])
-    merged["sources"] = after["sources"] | dict.fromkeys(changed(sources, after["sources"]), MIXED)
+    merged["sources"] = after["sources"] | dict.fromkeys(
+        list_differing_files(sources, after["sources"]), MIXED
+    )
     prerequisite = after.get(PREREQUISITES, [])
     if earlier := [one for one in before.get(PREREQUISITES, []) if one not in prerequisite]:
         merged[PREREQUISITES] = [*prerequisite, *earlier]

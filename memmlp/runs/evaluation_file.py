@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import now, plain, read_json, to_number, write_json
-from memmlp.runs.environment import environment
+from memmlp.common.files import make_json_safe, now, read_json, to_number, write_json
+from memmlp.runs.environment import describe_environment
 from memmlp.runs.identity import (
-    belongs,
-    evaluation_id_of,
-    outdated,
-    solver_of,
-    used_as_configured,
-    version_of,
+    belongs_to_folder,
+    find_version,
+    has_configured_inference,
+    hash_evaluation_settings,
+    list_outdated,
+    name_solver,
 )
 
 COMBINED = "combined"
@@ -27,8 +27,8 @@ COMBINED = "combined"
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
     """Write an evaluation file: the report with time, environment and a digest."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = plain({**report, "made": now(), "made_by": environment()})
-    write_json(path, content | {"digest": _content_digest(content)})
+    content = make_json_safe({**report, "made": now(), "made_by": describe_environment()})
+    write_json(path, content | {"digest": _compute_content_digest(content)})
 
 
 def read_report(path: Path) -> dict[str, Any]:
@@ -41,21 +41,21 @@ def read_report(path: Path) -> dict[str, Any]:
 def check_report(path: Path, report: Mapping[str, Any]) -> None:
     """Raise InputError if the content of an evaluation file is not a valid report."""
     if not {"mode", "mean", "clips"} <= report.keys():
-        raise InputError(f"{path}: damaged; remove it and repeat the run's command to evaluate again")
+        raise InputError(f"{path}: cannot be read; remove it and repeat the run's command to evaluate again")
 
 
-def intact(path: Path) -> bool:
+def is_intact(path: Path) -> bool:
     """Return whether an evaluation file is unchanged and has its original name and folder."""
     content = read_json(path)
-    same = content.pop("digest", None) == _content_digest(content)
+    same = content.pop("digest", None) == _compute_content_digest(content)
     named = content.get("name", path.stem) == path.stem
-    return same and named and belongs(content.get("run"), path.parent.parent)
+    return same and named and belongs_to_folder(content.get("run"), path.parent.parent)
 
 
-def current(path: Path, report: Mapping[str, Any]) -> bool:
+def is_current(path: Path, report: Mapping[str, Any]) -> bool:
     """Return whether an evaluation used the current component versions."""
     settings = report.get("settings") or {}
-    return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_id_of(settings)
+    return {"mode", "ik"} <= settings.keys() and path.stem == hash_evaluation_settings(settings)
 
 
 def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
@@ -64,26 +64,28 @@ def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
     Custom metrics from packages that are not in use are ignored.
     """
     comparable = {
-        name: number for name, number in report.get("component_versions", {}).items() if version_of(name)
+        name: number for name, number in report.get("component_versions", {}).items() if find_version(name)
     }
-    return ", ".join(outdated(comparable)) or None
+    return ", ".join(list_outdated(comparable)) or None
 
 
-def preference(path: Path, report: Mapping[str, Any], config: Mapping[str, Any]) -> tuple[bool, bool, str]:
+def make_preference_key(
+    path: Path, report: Mapping[str, Any], config: Mapping[str, Any]
+) -> tuple[bool, bool, str]:
     """Return a sort key for a run's evaluations; the preferred evaluation comes last.
 
     The order is by current component versions, then by the inverse kinematics in the run's config, then by
     time.
     """
     settings = report.get("settings") or {}
-    configured = solver_of(settings) == solver_of(config.get("evaluation") or {})
-    return current(path, report), configured, str(report.get("made"))
+    configured = name_solver(settings) == name_solver(config.get("evaluation") or {})
+    return is_current(path, report), configured, str(report.get("made"))
 
 
-def combined_by(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
-    """Return the inverse kinematics (`solver_of`) of the branch `combined`, by mode; the last report wins."""
+def find_combined_solvers(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
+    """Return the inverse kinematics (`name_solver`) of the branch `combined`, by mode; the last one wins."""
     return {
-        str(report.get("mode")): solver_of(report.get("settings") or {})
+        str(report.get("mode")): name_solver(report.get("settings") or {})
         for report in reports
         if COMBINED in report["mean"]
     }
@@ -94,15 +96,15 @@ def keep_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]
 
     So merged results never mix two kinds of inverse kinematics.
     """
-    last = combined_by(reports)
+    last = find_combined_solvers(reports)
 
     def fits(report: Mapping[str, Any]) -> bool:
-        return solver_of(report.get("settings") or {}) == last.get(str(report.get("mode")))
+        return name_solver(report.get("settings") or {}) == last.get(str(report.get("mode")))
 
-    return [dict(report) if fits(report) else _without_combined(report) for report in reports]
+    return [dict(report) if fits(report) else _remove_combined(report) for report in reports]
 
 
-def _without_combined(report: Mapping[str, Any]) -> dict[str, Any]:
+def _remove_combined(report: Mapping[str, Any]) -> dict[str, Any]:
     mean, *clips = (
         {branch: errors for branch, errors in row.items() if branch != COMBINED}
         for row in (report["mean"], *report.get("clips", ()))
@@ -115,7 +117,7 @@ def name_solvers(results: Mapping[str, Any], solvers: Mapping[str, str | None]) 
 
     Args:
         results: results by mode and branch; other entries are kept.
-        solvers: the inverse kinematics by mode (`combined_by`).
+        solvers: the inverse kinematics by mode (`find_combined_solvers`).
     """
 
     def rename(mode: str, branch: str) -> str:
@@ -129,7 +131,7 @@ def name_solvers(results: Mapping[str, Any], solvers: Mapping[str, str | None]) 
     }
 
 
-def _content_digest(content: Mapping[str, Any]) -> str:
+def _compute_content_digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -137,7 +139,7 @@ class EvaluationsAsConfigured:
     """A run's evaluations that match the run's config.
 
     Attributes:
-        paths: the evaluation files; the preferred one is last (`preference`).
+        paths: the evaluation files; the preferred one is last (`make_preference_key`).
     """
 
     def __init__(self, folder: Path, config: Mapping[str, Any]):
@@ -149,9 +151,11 @@ class EvaluationsAsConfigured:
         """
         every = {path: read_json(path) for path in sorted(folder.glob("*.json"))}
         matching = [
-            (path, one) for path, one in every.items() if used_as_configured(one.get("settings", {}), config)
+            (path, one)
+            for path, one in every.items()
+            if has_configured_inference(one.get("settings", {}), config)
         ]
-        self._matching = dict(sorted(matching, key=lambda one: preference(one[0], one[1], config)))
+        self._matching = dict(sorted(matching, key=lambda one: make_preference_key(one[0], one[1], config)))
         self.paths = list(self._matching)
 
     @property
@@ -176,7 +180,7 @@ class EvaluationsAsConfigured:
         Raises:
             InputError: if a file is damaged.
         """
-        return combined_by(self._read_reports())
+        return find_combined_solvers(self._read_reports())
 
     @property
     def outdated(self) -> dict[str, str]:

@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 
 from memmlp.common.files import read_json
 from memmlp.common.lease import is_alive
-from memmlp.runs.environment import prerequisite_versions
-from memmlp.runs.identity import NETWORK, outdated
+from memmlp.runs.environment import collect_prerequisite_versions
+from memmlp.runs.identity import NETWORK, list_outdated
 from memmlp.runs.lookup import describe_kind, list_runs, read_notes
 from memmlp.runs.run import Run
 
 REASONS = ("failed", "old", "orphaned")
 
 
-class Garbage(NamedTuple):
+class GarbageRun(NamedTuple):
     """A run that may be deleted.
 
     Attributes:
@@ -33,7 +33,7 @@ class Garbage(NamedTuple):
     size: int
 
 
-def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
+def find_garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[GarbageRun]:
     """Find the runs that may be deleted.
 
     Runs in progress, runs with a tag or a note, and prerequisites of remaining runs are never returned.
@@ -43,22 +43,22 @@ def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
         kinds: the REASONS to search for.
     """
     runs = list_runs(outputs)
-    orphans, requested = _orphans(outputs, runs), set(kinds)
+    orphans, requested = _find_orphans(outputs, runs), set(kinds)
     candidates = {}
     for run in runs:
-        kind, reason = _reason(run, orphans)
-        if kind in requested and not _marked(run) and run.state(False) != "running":
-            candidates[run.id] = Garbage(run, kind, reason, _size(run.folder))
+        kind, reason = _find_deletion_reason(run, orphans)
+        if kind in requested and not _has_notes(run) and run.state(False) != "running":
+            candidates[run.id] = GarbageRun(run, kind, reason, _sum_file_sizes(run.folder))
     while candidates.keys() & (used := _list_prerequisites(run for run in runs if run.id not in candidates)):
         candidates = {run_id: one for run_id, one in candidates.items() if run_id not in used}
     return list(candidates.values())
 
 
-def delete(garbage_run: Garbage) -> bool:
+def delete(garbage_run: GarbageRun) -> bool:
     """Delete a run's folder, its marker first. Returns False if the run is in use, or has tags or a note."""
     run = garbage_run.run
     with run.lock(wait=False) as lease:
-        if not lease or _marked(run):
+        if not lease or _has_notes(run):
             return False
         run.reset()
         shutil.rmtree(run.folder)
@@ -69,23 +69,23 @@ def _list_prerequisites(runs: Iterable[Run]) -> set[str | None]:
     return {run.manifest.get("prerequisite") for run in runs}
 
 
-def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
+def _find_deletion_reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
     if run.failure and not run.done:  # a trained run may have failed only in an export
         return "failed", run.failure
-    if changed := outdated(
-        {**prerequisite_versions(run.manifest), **(run.manifest.get("component_versions") or {})}
+    if changed := list_outdated(
+        {**collect_prerequisite_versions(run.manifest), **(run.manifest.get("component_versions") or {})}
     ):
         return "old", f"older version: {', '.join(changed)}"
     return ("orphaned", orphans[run.id]) if run.id in orphans else ("", "")
 
 
-def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
+def _find_orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     """Return the reason why a run is an orphan, by run id.
 
     Orphans are prerequisite runs that are in no plan and that no run uses, and folders of runs that never
     started.
     """
-    planned = {task["id"] for path in _plans(outputs) for task in _listed(path, "tasks")}
+    planned = {task["id"] for path in _list_plans(outputs) for task in _read_entries(path, "tasks")}
     used = _list_prerequisites(runs) | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
     unused = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
@@ -94,7 +94,7 @@ def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     return reasons | {run.id: "an empty folder" for run in empty}
 
 
-def _plans(outputs: Path) -> Iterator[Path]:
+def _list_plans(outputs: Path) -> Iterator[Path]:
     """Yield the plan files of sweeps, and of searches in progress."""
     yield from outputs.glob("sweeps/*/plan.json")
     for path in outputs.glob("*/*/controllers/*.process"):
@@ -102,16 +102,16 @@ def _plans(outputs: Path) -> Iterator[Path]:
             yield path.with_suffix(".json")
 
 
-def _listed(path: Path, key: str) -> Iterator[Mapping[str, Any]]:
+def _read_entries(path: Path, key: str) -> Iterator[Mapping[str, Any]]:
     entries = read_json(path).get(key)
     yield from (one for one in entries or () if isinstance(one, dict) and "id" in one)
 
 
-def _marked(run: Run) -> bool:
+def _has_notes(run: Run) -> bool:
     """Return whether the run has a tag or a note."""
     notes = read_notes(run)
     return bool(notes.tags or notes.note)
 
 
-def _size(folder: Path) -> int:
+def _sum_file_sizes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.components import SLOTS, declared
-from memmlp.common.files import plain
+from memmlp.common.components import SLOTS, collect_components
+from memmlp.common.files import make_json_safe
 
 VERSIONS: dict[str, int] = {
     # the inputs of networks (memmlp.motion)
@@ -57,19 +57,19 @@ VERSIONS: dict[str, int] = {
 """The versions of components that are not an option of a slot."""
 
 
-def version_of(component: str) -> int:
+def find_version(component: str) -> int:
     """Return the version of a component by name, SLOT.NAME or a key of VERSIONS; 0 if it is not in use."""
     slot, _, name = component.partition(".")
-    declaration = declared().get((slot, name))
+    declaration = collect_components().get((slot, name))
     return VERSIONS.get(component, declaration.version if declaration else 0)
 
 
 def find_versions(components: Iterable[str]) -> dict[str, int]:
     """Return the versions of components, by name; 0 for a component that is not in use."""
-    return {name: version_of(name) for name in sorted(components)}
+    return {name: find_version(name) for name in sorted(components)}
 
 
-def outdated(recorded: Mapping[str, int]) -> list[str]:
+def list_outdated(recorded: Mapping[str, int]) -> list[str]:
     """Describe each recorded component version that differs from the current version: "name old -> new"."""
     now = find_versions(recorded)
     return [f"{name} {number} -> {now[name]}" for name, number in recorded.items() if now[name] != number]
@@ -143,7 +143,7 @@ class Identity:
         """A hash of everything that affects the result, 16 hex digits."""
         content = {
             "kind": self.kind,
-            "config": training_config(self.config),
+            "config": select_training_config(self.config),
             "data": self.data,
             "prerequisite": self.prerequisite.id if self.prerequisite else None,
             "component_versions": self.component_versions,
@@ -151,26 +151,28 @@ class Identity:
         return _digest(content)
 
 
-def evaluation_id(config: Mapping[str, Any], mode: str, groups_digest: str | None = None) -> str:
+def compute_evaluation_id(config: Mapping[str, Any], mode: str, groups_digest: str | None = None) -> str:
     """Return the id of a run's evaluation in a mode: mode, inverse kinematics and 16 hex digits."""
-    return evaluation_id_of(evaluation_settings(config, mode, groups_digest))
+    return hash_evaluation_settings(select_evaluation_settings(config, mode, groups_digest))
 
 
-def evaluation_id_of(settings: Mapping[str, Any]) -> str:
+def hash_evaluation_settings(settings: Mapping[str, Any]) -> str:
     """Return the id of an evaluation with these settings and the current component versions."""
     mode, ik = settings["mode"], settings["ik"]
     name = mode if ik == "off" else f"{mode}-{ik}"
-    return f"{name}-{_digest({'settings': settings, 'component_versions': evaluation_versions(settings)})}"
+    return (
+        f"{name}-{_digest({'settings': settings, 'component_versions': find_evaluation_versions(settings)})}"
+    )
 
 
-def evaluation_versions(settings: Mapping[str, Any]) -> dict[str, int]:
+def find_evaluation_versions(settings: Mapping[str, Any]) -> dict[str, int]:
     """Return the versions of all components that an evaluation uses, by name."""
     solver = [f"ik.{settings['ik']}"] if settings["ik"] != "off" else []
     own = [f"metric.{name}" for name in settings.get("metrics", ())]
     return find_versions(["metrics", f"mode.{settings['mode']}", *solver, *own])
 
 
-def evaluation_settings(
+def select_evaluation_settings(
     config: Mapping[str, Any], mode: str, groups_digest: str | None = None
 ) -> dict[str, Any]:
     """Return the settings that determine an evaluation's result, in addition to the run and its data.
@@ -190,14 +192,20 @@ def evaluation_settings(
         "source_groups": {name: own for name, source in sources if (own := source.get("groups"))},
         "groups_file": groups_digest,
     }
-    drawn = {"batch": chosen.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
-    custom = {name: declared().get(("metric", name)) for name in sorted(chosen.get("metrics") or ())}
+    drawn = (
+        {"batch": chosen.get("batch")}
+        if select_inference_config(config).get("memory.blend") == "sampled"
+        else {}
+    )
+    custom = {
+        name: collect_components().get(("metric", name)) for name in sorted(chosen.get("metrics") or ())
+    }
     metrics = {name: f"{one.module}.{one.builds}" if one else "" for name, one in custom.items()}
     further = {key: value for key, value in {**groups, "metrics": metrics}.items() if value}
-    return {"mode": mode, **solver, **inference(config), **drawn, **further}
+    return {"mode": mode, **solver, **select_inference_config(config), **drawn, **further}
 
 
-def solver_of(settings: Mapping[str, Any]) -> str | None:
+def name_solver(settings: Mapping[str, Any]) -> str | None:
     """Return the name of the inverse kinematics in evaluation settings, such as "arms"; None without one.
 
     For L-BFGS, the name contains the number of iterations: "lbfgs-15".
@@ -208,28 +216,30 @@ def solver_of(settings: Mapping[str, Any]) -> str | None:
     return f"{ik}-{iterations}" if ik == "lbfgs" and iterations else str(ik)
 
 
-def deployment_id(config: Mapping[str, Any]) -> str:
+def compute_deployment_id(config: Mapping[str, Any]) -> str:
     """Return the id of a run's deployment: precision and 16 hex digits."""
-    return deployment_id_of(deployment_settings(config))
+    return hash_deployment_settings(select_deployment_settings(config))
 
 
-def deployment_id_of(settings: Mapping[str, Any]) -> str:
+def hash_deployment_settings(settings: Mapping[str, Any]) -> str:
     """Return the id of a deployment with these settings and the current component versions."""
     name = settings.get("precision", "fp32")
-    return f"{name}-{_digest({'settings': settings, 'component_versions': deployment_versions(settings)})}"
+    return (
+        f"{name}-{_digest({'settings': settings, 'component_versions': find_deployment_versions(settings)})}"
+    )
 
 
-def deployment_versions(settings: Mapping[str, Any]) -> dict[str, int]:
+def find_deployment_versions(settings: Mapping[str, Any]) -> dict[str, int]:
     """Return the versions of all components that a deployment uses, by name."""
     graph, name = settings.get("graph", "auto"), settings.get("precision", "fp32")
     graphs = [f"graph.{one}" for one in ("streaming", "naive") if graph in (one, "auto")]
     return find_versions(["export", "latency", *graphs, *([name] if name != "fp32" else [])])
 
 
-def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+def select_deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that determine a deployment's result, in addition to the run and its data."""
-    own = {key: _canonical(value) for key, value in config.get("export", {}).items()}
-    return own | inference(config)
+    own = {key: _normalize_numbers(value) for key, value in config.get("export", {}).items()}
+    return own | select_inference_config(config)
 
 
 def list_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
@@ -239,7 +249,7 @@ def list_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
         yield "mirror"
     if coordinates := config.get("normalizer", {}).get("coordinates"):
         yield f"coordinates.{coordinates}"
-    yield from (f"{slot}.{name}" for slot in SLOTS if (name := option_in_slot(config, slot)))
+    yield from (f"{slot}.{name}" for slot in SLOTS if (name := find_option(config, slot)))
     if (config.get("loss") or {}).get("weighting") == "learned":
         yield "weighting.learned"
     optim = config.get("optim", {})
@@ -248,44 +258,44 @@ def list_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
     yield from (name for name in ("warmup", "ema") if optim.get(name))
     if optim.get("precision") == "bf16":
         yield "precision.bf16"
-    if kind == "vqvae" or option_in_slot(config, "memory") == "vq_joint":
+    if kind == "vqvae" or find_option(config, "memory") == "vq_joint":
         yield from ("vqvae", f"codebook.{config.get('vqvae', {}).get('codebook')}")
     if kind == "vqvae":
         yield "schedule.milestones"
 
 
-def training_settings(kind: str, config: Mapping[str, Any]) -> Mapping[str, Any]:
+def find_training_settings(kind: str, config: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the config group with the number of training steps for a kind of run."""
     if kind == "vqvae":
         return config["vqvae"]
     return config["optim"] if kind == NETWORK else config["prerequisite"][kind]
 
 
-def option_in_slot(config: Mapping[str, Any], slot: str) -> str | None:
+def find_option(config: Mapping[str, Any], slot: str) -> str | None:
     """Return the name of the option in a slot; None if the slot is empty."""
     return (config.get(slot) or {}).get("name")
 
 
-def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
+def select_training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the config values that can change a training's result, by dotted key, without null values."""
-    rollout = option_in_slot(config, "rollout") or "teacher_forcing"
+    rollout = find_option(config, "rollout") or "teacher_forcing"
     as_live = config.get("refiner") or config.get("prerequisite") or rollout != "teacher_forcing"
     out = (*NEUTRAL, *EVALUATION, *DEPLOYMENT, *(() if as_live else INFERENCE))
     flat = {key: value for key, value in flatten(config).items() if value is not None}
-    counting = [key for key in flat if DRAWS.fullmatch(key) or not _below(key, out)]
-    return {key: _canonical(flat[key]) for key in counting}
+    counting = [key for key in flat if DRAWS.fullmatch(key) or not _is_below(key, out)]
+    return {key: _normalize_numbers(flat[key]) for key in counting}
 
 
-def changes_training(key: str, config: Mapping[str, Any]) -> bool:
+def affects_training(key: str, config: Mapping[str, Any]) -> bool:
     """Return whether a dotted key can affect the training with this config, or its data."""
-    return key.startswith("data.") or any(_below(name, [key]) for name in training_config(config))
+    return key.startswith("data.") or any(_is_below(name, [key]) for name in select_training_config(config))
 
 
-def validated_on(config: Mapping[str, Any]) -> dict[str, Any]:
+def select_validation_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the config values that determine the validation clips of a training, by dotted key."""
     flat = flatten({"data": config.get("data") or {}})
     drawn = {key for key in flat if DRAWS.fullmatch(key) or key == "data.split.train_fraction"}
-    return {key: _canonical(value) for key, value in flat.items() if key not in drawn}
+    return {key: _normalize_numbers(value) for key, value in flat.items() if key not in drawn}
 
 
 def is_data_path(key: str) -> bool:
@@ -293,7 +303,7 @@ def is_data_path(key: str) -> bool:
     return DATA_PATH.fullmatch(key) is not None
 
 
-def belongs(run_id: str | None, folder: Path) -> bool:
+def belongs_to_folder(run_id: str | None, folder: Path) -> bool:
     """Return whether a file that records a run id is in the folder of that run.
 
     A folder that is not named by an id is a copy of a run; all its files belong to it.
@@ -301,12 +311,12 @@ def belongs(run_id: str | None, folder: Path) -> bool:
     return run_id in (None, folder.name) or not ID.fullmatch(folder.name)
 
 
-def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+def has_configured_inference(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
     """Return whether a stage's settings have the same INFERENCE values as the run's config."""
-    return all(settings.get(key) == value for key, value in inference(config).items())
+    return all(settings.get(key) == value for key, value in select_inference_config(config).items())
 
 
-def describe_other_export(settings: Mapping[str, Any], config: Mapping[str, Any]) -> str:
+def describe_export_difference(settings: Mapping[str, Any], config: Mapping[str, Any]) -> str:
     """Return the export settings in which a deployment differs from the run's config, such as "naive-int8".
 
     The text is empty without a difference. `export.graph=off` in the config counts as the default graph.
@@ -318,25 +328,25 @@ def describe_other_export(settings: Mapping[str, Any], config: Mapping[str, Any]
     return "-".join(f"opset{value}" if key == "opset" else str(value) for key, value in other.items())
 
 
-def inference(config: Mapping[str, Any]) -> dict[str, Any]:
+def select_inference_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the INFERENCE values of a config, by dotted key."""
     flat = flatten(config)
-    return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}
+    return {key: _normalize_numbers(flat[key]) for key in INFERENCE if key in flat}
 
 
-def _below(key: str, names: Iterable[str]) -> bool:
+def _is_below(key: str, names: Iterable[str]) -> bool:
     return any(key == name or key.startswith(f"{name}.") for name in names)
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    text = json.dumps(plain(content), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    text = json.dumps(make_json_safe(content), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _canonical(value: Any) -> Any:
+def _normalize_numbers(value: Any) -> Any:
     """Convert floats that are whole numbers to int, so that 1.0 and 1 have the same hash."""
     if isinstance(value, list | tuple):
-        return [_canonical(item) for item in value]
+        return [_normalize_numbers(item) for item in value]
     if isinstance(value, float) and value.is_integer():
         return int(value)
     return value

@@ -67,7 +67,7 @@ def describe_kind(kind: str) -> str:
     return "VQ-VAE" if kind == "vqvae" else kind.replace("_", " ")
 
 
-def run_name(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> str:
+def get_run_name(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> str:
     """Return a run's name, which shows how its config differs from the default config.
 
     Args:
@@ -78,7 +78,7 @@ def run_name(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> str:
     return str(manifest.get("name") or describe_kind(str(manifest.get("kind") or "run")) + seed)
 
 
-def frames_seen(run: Run) -> float:
+def count_training_frames(run: Run) -> float:
     """Return the number of frames that a run's network saw in all training steps; 0 if unknown.
 
     For a refiner, the frames of the network that it refines are included.
@@ -89,15 +89,15 @@ def frames_seen(run: Run) -> float:
     seen = float((optim.get("steps") or 0) * (optim.get("batch") or 0) * length)
     if not refiner:
         return seen
-    before = frames_seen(Run(run.folder.parent / str(run.manifest.get("prerequisite"))))
+    before = count_training_frames(Run(run.folder.parent / str(run.manifest.get("prerequisite"))))
     return seen + before if seen and before else 0.0
 
 
-def hardly_trained(frames: float) -> str:
+def warn_if_hardly_trained(frames: float) -> str:
     """Return a warning if a network saw less than half an hour of motion in training; otherwise "".
 
     Args:
-        frames: the number of frames from `frames_seen`; 0 if unknown.
+        frames: the number of frames from `count_training_frames`; 0 if unknown.
     """
     if not 0 < frames < LITTLE:
         return ""
@@ -137,7 +137,7 @@ def read_notes(run: Run) -> Notes:
 def add_tags(run: Run, tags: Iterable[str]) -> Notes:
     """Add tags to a run. Raises InputError for an invalid tag."""
     notes = read_notes(run)
-    return _write(run, Notes(tuple(sorted({*notes.tags, *map(_checked, tags)})), notes.note))
+    return _write_notes(run, Notes(tuple(sorted({*notes.tags, *map(_check_tag, tags)})), notes.note))
 
 
 def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
@@ -146,22 +146,22 @@ def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
     if missing := sorted(removed - set(notes.tags)):
         existing = ", ".join(notes.tags) or "none"
         raise InputError(f"tag '{missing[0]}': run {run.id} does not have this tag; its tags: {existing}")
-    return _write(run, Notes(tuple(tag for tag in notes.tags if tag not in removed), notes.note))
+    return _write_notes(run, Notes(tuple(tag for tag in notes.tags if tag not in removed), notes.note))
 
 
 def set_note(run: Run, note: str) -> Notes:
     """Replace a run's note; an empty note removes it. Raises InputError if the note is too long."""
     if len(note) > MAX_LENGTH:
         raise InputError(f"note: must have at most {MAX_LENGTH} characters, but has {len(note)}")
-    return _write(run, Notes(read_notes(run).tags, note.strip()))
+    return _write_notes(run, Notes(read_notes(run).tags, note.strip()))
 
 
-def _checked(tag: str) -> str:
+def _check_tag(tag: str) -> str:
     if not TAG.fullmatch(tag):
         raise InputError(f"tag '{tag}': must be up to 64 letters, digits and . _ + / : -")
     return tag
 
 
-def _write(run: Run, notes: Notes) -> Notes:
+def _write_notes(run: Run, notes: Notes) -> Notes:
     write_json(notes_path(run), {"tags": list(notes.tags), "note": notes.note})
     return notes

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write, plain
+from memmlp.common.files import atomic_write, make_json_safe
 from memmlp.common.lease import check_owner
 
 
@@ -56,7 +56,7 @@ class MetricsLog:
         if not self._whole:
             self.repair()
         entry = {"step": step, "phase": phase, "time": round(time.time(), 3), "values": dict(values)}
-        line = json.dumps(plain(entry), allow_nan=False).encode() + b"\n"
+        line = json.dumps(make_json_safe(entry), allow_nan=False).encode() + b"\n"
         with open(self.path, "ab", buffering=0) as file:
             check_owner(self.path)  # check again: `repair` of the next owner replaces the file
             self._whole = False

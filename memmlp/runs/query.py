@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import to_number
-from memmlp.runs.deployment_folder import with_times_as_deployed
+from memmlp.runs.deployment_folder import replace_with_deployed_times
 from memmlp.runs.evaluation_file import name_solvers
-from memmlp.runs.identity import SLOTS, flatten, option_in_slot, training_config
-from memmlp.runs.lookup import read_notes, run_name
+from memmlp.runs.identity import SLOTS, find_option, flatten, select_training_config
+from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.run import STATUSES, Run
 
 Record = Mapping[str, Any]
@@ -30,7 +30,7 @@ COMPARISONS = ("=", "==", "!=", *ORDER)
 SHORT = 8  # number of digits in a shortened digest
 
 
-def record(run: Run) -> dict[str, Any]:
+def build_record(run: Run) -> dict[str, Any]:
     """Return the values of a run that conditions can use, by key.
 
     - Facts: id, kind, status, name, started, prerequisite, user, tag, note, `data` (the data's name) and
@@ -44,19 +44,19 @@ def record(run: Run) -> dict[str, Any]:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     named = name_solvers(run.results, run.evaluations_as_configured.combined_solvers)
-    results = {key: to_number(value) for key, value in flatten(with_times_as_deployed(named)).items()}
+    results = {key: to_number(value) for key, value in flatten(replace_with_deployed_times(named)).items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
-    slots = {slot: option_in_slot(config, slot) for slot in SLOTS if slot in config}
+    slots = {slot: find_option(config, slot) for slot in SLOTS if slot in config}
     facts = {name: manifest.get(name) for name in ("kind", "started", "prerequisite", "user")}
     digest = str(manifest.get("data") or "")
     facts |= {"data": flat.get("data.name") or digest[:SHORT], "data_digest": digest}
-    facts |= {"id": run.id, "name": run_name(manifest, flat), "status": run.status}
+    facts |= {"id": run.id, "name": get_run_name(manifest, flat), "status": run.status}
     facts |= {"tag": notes.tags, "note": notes.note}
     return {**flat, **slots, **short, **results, **facts}
 
 
-def data_labels(records: Sequence[Record]) -> list[str]:
+def label_data(records: Sequence[Record]) -> list[str]:
     """Return a label for each record's data: its name, with a short digest if the name is ambiguous.
 
     The record of a VQ-VAE does not name its data; it gets the name from another record with the same data.
@@ -73,7 +73,7 @@ def data_labels(records: Sequence[Record]) -> list[str]:
     ]
 
 
-def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) -> list[str]:
+def list_differing_keys(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) -> list[str]:
     """Return the config keys that can change a result and have different values in the configs.
 
     If a slot has different options, only the slot is returned. Keys inside the slot are returned only if
@@ -85,7 +85,9 @@ def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) ->
         data: the data digest of each config.
     """
     flats = [flatten(config) for config in configs]
-    counting = {key for config in configs for key in training_config(config)} | _of_data(flats, data)
+    counting = {
+        key for config in configs for key in select_training_config(config)
+    } | _list_differing_data_keys(flats, data)
     counting |= {
         key for flat in flats for key in flat if key.startswith(("evaluation.ik", "export.precision"))
     }
@@ -101,7 +103,7 @@ def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) ->
     ]
 
 
-def _of_data(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[str]:
+def _list_differing_data_keys(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[str]:
     """Return the `data` keys that differ between data sets with the same name."""
     named: dict[Any, dict[str, Mapping[str, Any]]] = {}
     for flat, digest in zip(flats, digests, strict=False):
@@ -114,10 +116,10 @@ def _of_data(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[
     }
 
 
-def as_typed(value: Any) -> str:
+def format_typed_value(value: Any) -> str:
     """Format a value for a condition or a table column."""
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(as_typed, value))}]"
+        return f"[{','.join(map(format_typed_value, value))}]"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -161,13 +163,12 @@ class Query(NamedTuple):
         for key in self.numbers:
             values = [one[key] for one in records if key in one]
             if values and all(isinstance(value, str | list | tuple) for value in values):
-                raise InputError(
-                    f"{option}: {key} must be a number for < or >, but is {as_typed(values[0])}; use = or !="
-                )
+                value = format_typed_value(values[0])
+                raise InputError(f"{option}: {key} must be a number for < or >, but is {value}; use = or !=")
         return [self.condition(one) for one in records]
 
 
-def parse(text: str) -> Query:
+def parse_query(text: str) -> Query:
     """Parse a condition. Raises InputError if it is not valid."""
     tokens = _Tokens(text)
     groups: list[list[Condition]] = [[]]
@@ -216,7 +217,7 @@ class _Tokens:
         kind, value = self.read_token(f"a value after {key}{sign}")
         if kind == "op":
             raise self.make_error(f"expected a value after {key}{sign}, but found '{value}'")
-        if sign in ORDER and _number(value) is None and key != "started":
+        if sign in ORDER and _parse_number(value) is None and key != "started":
             raise self.make_error(f"expected a number after {key}{sign}, but found '{value}'")
         if key == "status" and value not in (*STATUSES, "damaged"):
             statuses = ", ".join([*STATUSES, "damaged"])
@@ -225,35 +226,35 @@ class _Tokens:
         if key == "started" and sign in ORDER:  # ISO 8601 times, which may be typed in part, like 2025-03
             return lambda one: bool(one.get(key)) and ORDER[sign](str(one[key]), value)
         self.numbers += [key] if sign in ORDER else []
-        return lambda one: _holds(one.get(key), sign, value)
+        return lambda one: _is_satisfied(one.get(key), sign, value)
 
     def make_error(self, reason: str) -> InputError:
         return InputError(f"--where '{self.text}': {reason}; use comparisons (= != < <= > >=), and, or")
 
 
-def _holds(actual: Any, sign: str, value: str) -> bool:
+def _is_satisfied(actual: Any, sign: str, value: str) -> bool:
     """Return whether a comparison is true.
 
     With a missing value or NaN, comparisons with < and > are false.
     """
     if sign in ORDER:
-        number = _number(value)
+        number = _parse_number(value)
         comparable = isinstance(actual, int | float) and not isinstance(actual, bool)
         return comparable and number is not None and ORDER[sign](actual, number)
-    return _equal(actual, value) == (sign != "!=")
+    return _is_equal(actual, value) == (sign != "!=")
 
 
-def _equal(actual: Any, value: str) -> bool:
+def _is_equal(actual: Any, value: str) -> bool:
     """Return whether a run's value equals a typed one; a number may be typed rounded, like tables show it."""
     if isinstance(actual, tuple):  # the tags of a run
         return value in actual
     if isinstance(actual, int | float) and not isinstance(actual, bool):
-        return _number(value) in (actual, float(as_typed(actual)))
+        return _parse_number(value) in (actual, float(format_typed_value(actual)))
     typed = value.lower() if isinstance(actual, bool | None) else value.replace(", ", ",")
-    return as_typed(actual) == typed
+    return format_typed_value(actual) == typed
 
 
-def _number(text: str) -> float | None:
+def _parse_number(text: str) -> float | None:
     try:
         return float(text)
     except ValueError:

@@ -22,9 +22,21 @@ from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_
 from memmlp.common.lease import Lease, Lock, check_owner
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
-from memmlp.runs.environment import changed_since, changes, describe_sources, environment, host, join_origins
-from memmlp.runs.evaluation_file import EvaluationsAsConfigured, intact
-from memmlp.runs.identity import belongs, deployment_settings, describe_other_export, used_as_configured
+from memmlp.runs.environment import (
+    create_code_patch,
+    describe_environment,
+    describe_sources,
+    hash_host_name,
+    list_changed_files,
+    merge_run_origins,
+)
+from memmlp.runs.evaluation_file import EvaluationsAsConfigured, is_intact
+from memmlp.runs.identity import (
+    belongs_to_folder,
+    describe_export_difference,
+    has_configured_inference,
+    select_deployment_settings,
+)
 from memmlp.runs.metrics_log import LogRecord, MetricsLog
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
@@ -41,9 +53,9 @@ def _parse(text: str) -> Any:
     return yaml.load(text, LOADER)
 
 
-def latency_name(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
+def name_latency(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
     """Return "latency", or for another file than the config asks for, a name such as "latency-int8"."""
-    return "-".join(filter(None, ["latency", describe_other_export(deployed.settings, config)]))
+    return "-".join(filter(None, ["latency", describe_export_difference(deployed.settings, config)]))
 
 
 class Run:
@@ -113,11 +125,11 @@ class Run:
         return self.evaluation(stage).is_file() or self.deployment(stage).done
 
     @property
-    def wanted(self) -> tuple[str, ...]:
+    def requested_stages(self) -> tuple[str, ...]:
         """The ids of the evaluations and the deployment in the last request; empty for a prerequisite run."""
         return tuple(self.manifest.get("stages", ()))
 
-    def want(self, stages: Sequence[str]) -> None:
+    def request_stages(self, stages: Sequence[str]) -> None:
         """Record the ids of the requested evaluations and deployment."""
         if self.manifest.get("stages") != list(stages):
             self.write_manifest({"stages": list(stages)})
@@ -125,7 +137,7 @@ class Run:
     @property
     def complete(self) -> bool:
         """Whether the run is trained and has all requested evaluations and deployments."""
-        return self.done and all(map(self.has, self.wanted))
+        return self.done and all(map(self.has, self.requested_stages))
 
     @property
     def preferred_deployment(self) -> DeploymentFolder:
@@ -139,7 +151,7 @@ class Run:
             config,
             lambda one: (
                 one.is_current, bool(one.accurate_int8_file),
-                not describe_other_export(one.settings, config), one.creation_time,
+                not describe_export_difference(one.settings, config), one.creation_time,
             ),
         )  # fmt: skip
 
@@ -152,13 +164,13 @@ class Run:
         """Return the deployment with the measurements for tables, given the run's config.
 
         The order of preference is: the export settings of the config, current component versions, exactly the
-        settings of the config, the latest. `latency_name` names different export settings.
+        settings of the config, the latest. `name_latency` names different export settings.
         """
-        requested = deployment_settings(config)
+        requested = select_deployment_settings(config)
         return self._best_deployment(
             config,
             lambda one: (
-                not describe_other_export(one.settings, config), one.is_current,
+                not describe_export_difference(one.settings, config), one.is_current,
                 one.settings == requested, one.creation_time,
             ),
         )  # fmt: skip
@@ -167,7 +179,7 @@ class Run:
         self, config: Mapping[str, Any], rank: Callable[[DeploymentFolder], tuple[Any, ...]]
     ) -> DeploymentFolder:
         every = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
-        matching = [one for one in every if one.done and used_as_configured(one.settings, config)]
+        matching = [one for one in every if one.done and has_configured_inference(one.settings, config)]
         return max(matching, key=rank, default=None) or DeploymentFolder(self.deployments / "none")
 
     @property
@@ -284,12 +296,12 @@ class Run:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
-        if patch := changes():
+        if patch := create_code_patch():
             atomic_write(self.folder / "code.patch", patch)
         identity = {"id": self.id, "kind": kind, "data": data, "prerequisite": prerequisite}
         before = self.manifest if self.checkpoint.exists() else {}
         sources = describe_sources(facts.get("plugins", ()))
-        origin = join_origins(before, {**facts, **environment(), **sources})
+        origin = merge_run_origins(before, {**facts, **describe_environment(), **sources})
         self.attempt("training")
         times = {"started": self.manifest.get("started", now()), "finished": None, "seconds": {}}
         self.write_manifest(identity | times | origin)
@@ -302,7 +314,13 @@ class Run:
     def attempt(self, stage: str) -> None:
         """Record that this process begins to work on a stage of the run."""
         self.retry()
-        attempt = {"started": now(), "pid": os.getpid(), "host": host(), "step": self.step, "stage": stage}
+        attempt = {
+            "started": now(),
+            "pid": os.getpid(),
+            "host": hash_host_name(),
+            "step": self.step,
+            "stage": stage,
+        }
         self.write_manifest({"attempts": [*self.manifest.get("attempts", []), attempt]})
 
     def write_manifest(self, fields: Mapping[str, Any]) -> None:
@@ -333,7 +351,7 @@ class Run:
         except (yaml.YAMLError, UnicodeDecodeError):
             config = None
         if not isinstance(config, dict):
-            raise InputError(f"{self.config_path}: damaged; remove the run folder to repeat the run")
+            raise InputError(f"{self.config_path}: cannot be read; remove the run folder to repeat the run")
         return config
 
     @property
@@ -352,7 +370,7 @@ class Run:
         results = read_json(self.results_path) | self.evaluations_as_configured.results
         config = self.config
         deployed = self.find_shown_deployment(config)
-        return results | ({latency_name(deployed, config): deployed.record} if deployed.record else {})
+        return results | ({name_latency(deployed, config): deployed.record} if deployed.record else {})
 
     @property
     def evaluations_as_configured(self) -> EvaluationsAsConfigured:
@@ -365,7 +383,7 @@ class Run:
 
         Files of the user's packages are included if the packages are found.
         """
-        return changed_since(self.manifest)
+        return list_changed_files(self.manifest)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
         """Append one line to the metrics log (`MetricsLog.append`)."""
@@ -391,7 +409,7 @@ class Run:
     def done(self) -> bool:
         """Whether the training is finished, and the marker file belongs to this run."""
         marker = read_json(self.marker)
-        return "artifacts" in marker and belongs(marker.get("id"), self.folder)
+        return "artifacts" in marker and belongs_to_folder(marker.get("id"), self.folder)
 
     @property
     def weights_digest(self) -> str | None:
@@ -418,7 +436,7 @@ class Run:
             artifacts |= {str(where / name): digest for name, digest in exported.items()}
         changed = [name for name, digest in artifacts.items() if not self._same(name, digest)]
         reports = sorted(self.evaluations.glob("*.json"))
-        return changed + [str(path.relative_to(self.folder)) for path in reports if not intact(path)]
+        return changed + [str(path.relative_to(self.folder)) for path in reports if not is_intact(path)]
 
     def _same(self, name: str, digest: str) -> bool:
         path = self.folder / name

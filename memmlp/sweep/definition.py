@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import plain, read_json, write_json
+from memmlp.common.files import make_json_safe, read_json, write_json
 from memmlp.common.overrides import Override
 from memmlp.evaluation.metric_facts import SMALLEST
 
@@ -220,7 +220,7 @@ def parse_seeds(value: Any, name: str) -> tuple[int, ...]:
 
 def save_sweep_copy(sweep: Sweep, folder: Path) -> None:
     """Write the sweep into its folder, unless the folder has the same content already."""
-    content = plain(asdict(sweep))
+    content = make_json_safe(asdict(sweep))
     if read_json(folder / SWEEP_FILE) != content:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / SWEEP_FILE, content)

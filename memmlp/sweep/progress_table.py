@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from memmlp.runs.identity import NETWORK, training_settings
+from memmlp.runs.identity import NETWORK, find_training_settings
 from memmlp.runs.lookup import describe_kind
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
@@ -173,7 +173,7 @@ def result(run: Run) -> str:
 
 def total_steps(task: RunTask) -> int:
     """Return the number of steps of the task's training."""
-    return int(training_settings(task.kind, task.config)["steps"])
+    return int(find_training_settings(task.kind, task.config)["steps"])
 
 
 def progress_text(run: Run, total: int) -> str:

@@ -30,8 +30,8 @@ from typing import Any
 
 import yaml
 
-from memmlp.common.errors import InputError, why_unreadable
-from memmlp.common.overrides import value_text
+from memmlp.common.errors import InputError, describe_read_error
+from memmlp.common.overrides import format_value
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.sweep.definition import (
     BRANCHES,
@@ -77,9 +77,9 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
     except OSError as error:
-        raise InputError(f"{path}: {why_unreadable(error)}; expected a readable sweep file") from None
+        raise InputError(f"{path}: {describe_read_error(error)}; expected a readable sweep file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not YAML: {why_unreadable(error)}") from None
+        raise InputError(f"{path}: not YAML: {describe_read_error(error)}") from None
     try:
         base = content.get("base") if isinstance(content, Mapping) else None
         prepare([text for text in base if isinstance(text, str)] if isinstance(base, list) else [])
@@ -191,7 +191,7 @@ def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]
     found: dict[frozenset[str], tuple[str, ...]] = {}
     for grid in grids:
         for values in itertools.product(*grid.values()):
-            cell = tuple(f"{key}={value_text(value)}" for key, value in zip(grid, values, strict=True))
+            cell = tuple(f"{key}={format_value(value)}" for key, value in zip(grid, values, strict=True))
             found.setdefault(frozenset(cell), cell)
     return list(found.values())
 

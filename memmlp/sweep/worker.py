@@ -15,7 +15,7 @@ from pathlib import Path
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_disk_error
 from memmlp.common.files import read_json, write_json
-from memmlp.common.lease import Changes, current_process, is_alive
+from memmlp.common.lease import ChangeTimer, current_process, is_alive
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
@@ -23,7 +23,7 @@ PAUSE = 0.5  # seconds between two looks at a plan while other workers do its ta
 ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
 DEATHS = 10  # workers that died at the same step of a run before it counts as failed
 
-_changes = Changes()
+_changes = ChangeTimer()
 
 Perform = Callable[[Plan, RunTask], None]
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.progress import Count, label_progress, notify, show_progress
+from memmlp.common.progress import ProgressCounter, label_progress, notify, show_progress
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
@@ -149,7 +149,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
         group["lr"] = group["initial_lr"] * optim.compute_factor(step)
     device = task.dataset.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
-    with mixed, distributed.share_batch():
+    with mixed, distributed.split_batch():
         result = task.step(step)
         seen = gather_batch(result)
     check_finite(task, seen, step)
@@ -164,7 +164,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
 
 def gather_batch(result: StepResult) -> StepResult:
     """Return the mean loss and terms, and all clips, of a batch that several processes may share."""
-    if not distributed.is_shared():
+    if not distributed.is_batch_split():
         return result
     terms = torch.stack([result.loss, *result.terms.values()])
     loss, *means = distributed.average(terms.detach())
@@ -186,7 +186,13 @@ def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
 
 
 def record(
-    task: TrainingTask, optim: Optim, average: Average, run: Run, step: int, result: StepResult, count: Count
+    task: TrainingTask,
+    optim: Optim,
+    average: Average,
+    run: Run,
+    step: int,
+    result: StepResult,
+    count: ProgressCounter,
 ) -> dict[str, float]:
     """Log and show a finished step; return the values of a validation, or nothing where none was due."""
     last = step == optim.steps

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.components import chosen
+from memmlp.common.components import find_chosen_settings
 from memmlp.common.progress import announce, notify
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Skipped
@@ -19,9 +19,9 @@ from memmlp.motion.motion_source import MotionSource, Prepared
 from memmlp.motion.preparing.amass_names import absent_subsets
 from memmlp.motion.preparing.groups import divided_remark, unmatched_patterns_remark
 from memmlp.motion.preparing.manifest import ClipRecord, Manifest
-from memmlp.runs.environment import user_packages
+from memmlp.runs.environment import describe_user_packages
 from memmlp.runs.evaluation_file import read_report
-from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, Identity, deployment_id, evaluation_id
+from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, Identity, compute_deployment_id, compute_evaluation_id
 from memmlp.runs.run import Run
 
 SLOW = 0.99  # of the network's rate; 59.94 Hz counts as 60
@@ -48,12 +48,15 @@ class RunRequest:
     def evaluations(self) -> dict[str, str]:
         """The id of the evaluation, by mode."""
         groups = self.motion.groups_digest
-        return {mode: evaluation_id(self.config, mode, groups) for mode in self.config["evaluation"]["modes"]}
+        return {
+            mode: compute_evaluation_id(self.config, mode, groups)
+            for mode in self.config["evaluation"]["modes"]
+        }
 
     @property
     def deployment_id(self) -> str | None:
         """The id of the deployment; None if the network is not deployed."""
-        return None if self.config["export"]["graph"] == "off" else deployment_id(self.config)
+        return None if self.config["export"]["graph"] == "off" else compute_deployment_id(self.config)
 
     @property
     def stage_ids(self) -> tuple[str, ...]:
@@ -85,7 +88,7 @@ class RunRequest:
         if config["refiner"] is not None:
             bare = without_refiner(config)
             return [*RunRequest(bare, self.motion)._chain, (NETWORK, own)]
-        prerequisite: Any = chosen(config, "prerequisite")
+        prerequisite: Any = find_chosen_settings(config, "prerequisite")
         if prerequisite is not None:
             return [*prerequisite.prerequisites(config), (NETWORK, own)]
         if codes == "frozen":
@@ -97,7 +100,7 @@ class RunRequest:
 
 def codes_of(config: Mapping[str, Any]) -> str | None:
     """Return how the VQ-VAE of a config's memory is trained, "frozen" or "joint"; None without one."""
-    return getattr(chosen(config, "memory"), "codes", None) or None
+    return getattr(find_chosen_settings(config, "memory"), "codes", None) or None
 
 
 def without_refiner(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -132,7 +135,7 @@ def finished_outcome(request: RunRequest) -> Outcome | None:
         return None
     announce_data(data)
     with run.lock():
-        run.want(request.stage_ids)
+        run.request_stages(request.stage_ids)
     return Outcome(run, (), results_of(request, run), request.stage_ids)
 
 
@@ -166,7 +169,7 @@ def _measured_by_other_code(request: RunRequest, report: Mapping[str, Any]) -> b
 def own_code(request: RunRequest) -> dict[str, Any]:
     """Return version and digest of the user's packages that the config uses; empty if it uses none."""
     packages = request.config.get("plugins")
-    return {"plugins": user_packages(packages)} if packages else {}
+    return {"plugins": describe_user_packages(packages)} if packages else {}
 
 
 def results_of(request: RunRequest, run: Run) -> dict[str, Any]:

@@ -62,7 +62,7 @@ class TeacherForcing(Rollout):
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
-        clips, end = map(distributed.local_rows, sampler.draw(step))
+        clips, end = map(distributed.take_local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         stretch = dataset.stretches(clips, end, past + stride)
         state = model.true_state(stretch[:, :past])
@@ -97,7 +97,7 @@ class OwnPredictions(Rollout):
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
         """Draw the training call of a step, after the calls that make its history."""
-        clips, end = map(distributed.local_rows, sampler.draw(step))
+        clips, end = map(distributed.take_local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
         stretch = dataset.stretches(clips, end, past + stride * (passes + 1))
@@ -169,7 +169,7 @@ class PersistentStreams(Rollout):
         self.clip[who] = torch.where(going, self.clip[who], clips)
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
         self.lives[who] = True
-        self.who, mine, going = who, distributed.local_rows(who), distributed.local_rows(going)
+        self.who, mine, going = who, distributed.take_local_rows(who), distributed.take_local_rows(going)
         past, stride = model.past_frames, model.stride
         stretch = dataset.stretches(self.clip[mine], self.end[mine], past + stride)
         fresh = model.running_state(stretch[:, :past, :SPARSE_DIM])

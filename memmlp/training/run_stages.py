@@ -29,14 +29,14 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
-from memmlp.runs.environment import PREREQUISITES, prerequisite_origins
+from memmlp.runs.environment import PREREQUISITES, list_prerequisite_origins
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import (
     NETWORK,
     Identity,
-    deployment_settings,
-    evaluation_settings,
-    evaluation_versions,
+    find_evaluation_versions,
+    select_deployment_settings,
+    select_evaluation_settings,
 )
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
@@ -181,7 +181,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
         The names of the stages that were made.
     """
     made = []
-    run.want(experiment.stage_ids)
+    run.request_stages(experiment.stage_ids)
     if missing := unmeasured(experiment, run):
         if any(run.has(experiment.evaluations[mode]) for mode in missing):
             announce("evaluation: code of the metrics' packages has changed since they were measured")
@@ -272,7 +272,7 @@ def train_run(
     announce(f"network: train it for {steps} steps (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config, before)
     run.write_manifest({"body": data.manifest.body, **data_warnings(experiment.config, data)})
-    run.want(experiment.stage_ids)
+    run.request_stages(experiment.stage_ids)
     run.clear_stages()
     weights = before.weights() if before else None
     distributed.broadcast(NETWORK)  # tells the others what is trained now
@@ -291,11 +291,11 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
         model = experiment.architecture.load(run.weights()).to(experiment.device)
         test = data.open("test").to(experiment.device)
         for mode in modes:
-            settings = evaluation_settings(experiment.config, mode, experiment.motion.groups_digest)
+            settings = select_evaluation_settings(experiment.config, mode, experiment.motion.groups_digest)
             name = experiment.evaluations[mode]
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
             report |= {
-                "component_versions": evaluation_versions(settings),
+                "component_versions": find_evaluation_versions(settings),
                 **machine(experiment),
                 **own_code(experiment),
             }
@@ -331,7 +331,7 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
         record |= measure_pose(deployed.onnx, deployment.latency_steps)
         if (precision := deployment.precision) in record:
             record[precision] |= measure_pose(deployed.onnx_path(precision), deployment.latency_steps)
-        settings = deployment_settings(experiment.config)
+        settings = select_deployment_settings(experiment.config)
         deployed.finish({"run": run.manifest["id"], "settings": settings, **record})
 
 
@@ -345,7 +345,11 @@ def begin(
     above = identity.prerequisite
     counting: Mapping[str, Any] = {**(above.config if above else {}), **identity.config}
     facts = {
-        **({PREREQUISITES: prerequisite_origins(before.manifest, before.weights_digest)} if before else {}),
+        **(
+            {PREREQUISITES: list_prerequisite_origins(before.manifest, before.weights_digest)}
+            if before
+            else {}
+        ),
         "component_versions": identity.component_versions,
         **machine(experiment),
         "processes": distributed.world_size(),

@@ -250,7 +250,7 @@ class VQVAETask(TrainingTask):
 
     def step(self, step: int) -> StepResult:
         """Compute the loss on a batch of single frames."""
-        clips, end = map(distributed.local_rows, self.sampler.draw(step))
+        clips, end = map(distributed.take_local_rows, self.sampler.draw(step))
         frames = self.normalizer.encode(self.dataset.stretches(clips, end, 1))[:, 0]
         terms, indices = self.model.compute_losses(frames, self.normalizer)
         self.used = torch.bincount(distributed.gather_rows(indices), minlength=len(self.used)).float()

@@ -237,7 +237,7 @@ class PartTask(TrainingTask):
 
     def step(self, step: int) -> StepResult:
         """Compute the losses on a batch of windows."""
-        clips, end = map(distributed.local_rows, self.sampler.draw(step))
+        clips, end = map(distributed.take_local_rows, self.sampler.draw(step))
         terms = self.objective(self.dataset.stretches(clips, end, self.frames), True)
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 

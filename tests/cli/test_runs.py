@@ -11,7 +11,12 @@ from conftest import Memmlp, Ran, one_line
 
 from memmlp.common.files import write_json
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import VERSIONS, evaluation_id_of, evaluation_settings, evaluation_versions
+from memmlp.runs.identity import (
+    VERSIONS,
+    find_evaluation_versions,
+    hash_evaluation_settings,
+    select_evaluation_settings,
+)
 from memmlp.runs.run import Run
 
 A, B, C = ("a" * 16, "b" * 16, "c" * 16)
@@ -150,14 +155,14 @@ def test_results_by_an_earlier_recipe_are_told(
     for number, measured in ((1, (A, B)), (VERSIONS["mode.window"], (B,))):
         monkeypatch.setitem(VERSIONS, "mode.window", number)
         for name in measured:
-            settings = evaluation_settings({}, "window")
+            settings = select_evaluation_settings({}, "window")
             report = {
                 "mode": "window",
                 "settings": settings,
-                "component_versions": evaluation_versions(settings),
+                "component_versions": find_evaluation_versions(settings),
             }
             report |= {"mean": {"rotation": {"MPJPE": 5.0 + number}}, "clips": []}
-            write_report(Run.from_id(outputs, name).evaluation(evaluation_id_of(settings)), report)
+            write_report(Run.from_id(outputs, name).evaluation(hash_evaluation_settings(settings)), report)
     said = f"by an earlier version: mode.window 1 -> {number}"
     listed = memmlp("runs", "list").out
     assert f"window results {said}; memmlp eval RUN measures them again: {A[:8]}\n" in listed
@@ -257,7 +262,7 @@ def test_values_of_two_inverse_kinematics_are_named_and_not_subtracted(memmlp: M
         run, settings = Run.from_id(outputs, name), {"mode": "stream", "ik": ik}
         report = {"mode": "stream", "settings": settings, "mean": {"combined": {"MPJPE": value}}, "clips": []}
         run.evaluations.mkdir(exist_ok=True)
-        write_json(run.evaluation(evaluation_id_of(settings)), report)
+        write_json(run.evaluation(hash_evaluation_settings(settings)), report)
     said = memmlp("runs", "diff", A, B).out
     rows = {line.split()[0]: line.split() for line in said.splitlines() if "combined" in line}
     assert rows["stream.combined-arms.MPJPE"][1:4] == ["2.5", "-", "-"]

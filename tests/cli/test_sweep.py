@@ -20,7 +20,7 @@ from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep, make_plan
 from memmlp.config.worker_process import perform
-from memmlp.runs.identity import VERSIONS, version_of
+from memmlp.runs.identity import VERSIONS, find_version
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 from memmlp.sweep.progress_table import task_name
@@ -269,6 +269,6 @@ def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeyp
 
 
 def test_runs_with_another_component_version_are_missing(home: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(VERSIONS, "memory.none", version_of("memory.none") + 1)
+    monkeypatch.setitem(VERSIONS, "memory.none", find_version("memory.none") + 1)
     said = run(home, "table", "trial.yaml", *TINY, "optim.log_every=3")  # a new plan with the same results
     assert "missing: 'none' seed 0, 'wild' seed 0" in " ".join(said.split())

@@ -12,7 +12,7 @@ import tiny
 
 from memmlp.cli.web import describe_network
 from memmlp.common.errors import InputError
-from memmlp.common.npm import ONNXRUNTIME_WEB, tarball
+from memmlp.common.npm import ONNXRUNTIME_WEB, fetch_tarball
 from memmlp.runs.lookup import is_trained, list_runs
 
 pytestmark = pytest.mark.slow
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 def test_a_site_to_play_and_wear(home: Path):
     try:
-        tarball(ONNXRUNTIME_WEB)
+        fetch_tarball(ONNXRUNTIME_WEB)
     except InputError as error:
         pytest.skip(str(error))
     (run,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
@@ -52,5 +52,5 @@ def test_what_it_refuses(home: Path):
     said = command_line.run(home, "web", run, run[:5], "--out", "site", code=2)
     assert "only once" in said
     assert "other content" in command_line.run(home, "web", run, "--out", "outputs", code=2)
-    assert "begins so" in command_line.run(home, "web", "zzz", "--out", "site", code=2)
+    assert "first digits" in command_line.run(home, "web", "zzz", "--out", "site", code=2)
     assert not (home / "site").exists()

@@ -9,14 +9,21 @@ from pathlib import Path
 import pytest
 from own_package import registers_kept
 
-from memmlp.common.components import SLOTS, add_package, collect_attribute, declared, find, names
+from memmlp.common.components import (
+    SLOTS,
+    add_package,
+    collect_attribute,
+    collect_components,
+    find_component,
+    list_component_names,
+)
 from memmlp.common.errors import InputError
 from memmlp.networks.avatar_poser import EgoPoser, EgoPoserSettings
 
 TORCH_FREE = """
 import sys
-from memmlp.common.components import declared
-settings = [one.settings for one in declared().values()]
+from memmlp.common.components import collect_components
+settings = [one.settings for one in collect_components().values()]
 assert len(settings) >= 50
 print("torch" in sys.modules, "omegaconf" in sys.modules)
 """
@@ -68,14 +75,14 @@ def test_all_settings_are_read_without_torch():
 
 
 def test_every_shipped_component_can_be_imported():
-    for (slot, name), one in declared().items():
+    for (slot, name), one in collect_components().items():
         assert callable(one.kind), (slot, name)
         assert one.settings.option == f"{slot}={name}"
-    assert set(SLOTS) - {"term"} <= {slot for slot, _ in declared()}
+    assert set(SLOTS) - {"term"} <= {slot for slot, _ in collect_components()}
 
 
 def test_declared_settings_and_those_of_the_module_are_the_same():
-    found = find("model", "ego_poser")
+    found = find_component("model", "ego_poser")
     assert found.kind is EgoPoser
     assert found.settings is not EgoPoserSettings  # it was read without an import
     assert [spec for spec in found.settings.__dataclass_fields__] == [*EgoPoserSettings.__dataclass_fields__]
@@ -98,24 +105,24 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_package_adds_components_whose_settings_extend_each_other(package: Path):
     with registers_kept():
         add_package("mine", package)
-        one, two = find("memory", "one"), find("memory", "two")
+        one, two = find_component("memory", "one"), find_component("memory", "two")
         assert (one.version, two.version, two.module, two.package) == (4, 1, "mine.derived", "mine")
         assert collect_attribute(two.settings, "defaults") == {"loss": "manual", "hand": "off"}
         assert "mine.base" not in sys.modules
         made = two.build({"name": "two", "width": 5}, extra=7)
         assert (type(made).__name__, made.width, made.extra) == ("Two", 5, 7)
         assert two.make_settings({"name": "two", "depth": 9}).width == 3
-        assert find("hand", "keyless").kind.__name__ == "Keyless"
+        assert find_component("hand", "keyless").kind.__name__ == "Keyless"
         add_package("mine", None)
-        assert "one" not in names("memory")
+        assert "one" not in list_component_names("memory")
 
 
 def test_an_option_is_declared_once(package: Path):
     (package / "again.py").write_text('\n@component("memory", "gru")\nclass Mine: pass\n')
     with registers_kept():
-        with pytest.raises(InputError, match=r"again\.py: memory=gru: "):
+        with pytest.raises(InputError, match=r"again\.py: memory=gru exists already"):
             add_package("mine", package)
-        assert find("memory", "gru").package == "memmlp"
+        assert find_component("memory", "gru").package == "memmlp"
 
 
 def test_settings_that_need_the_module_are_an_error(package: Path):
@@ -124,9 +131,9 @@ def test_settings_that_need_the_module_are_an_error(package: Path):
     with registers_kept():
         add_package("mine", package)
         with pytest.raises(InputError, match=r"base\.py: .*COMPUTED"):
-            _ = find("memory", "one").settings
+            _ = find_component("memory", "one").settings
 
 
 def test_an_unknown_option_is_one_line_with_the_known_ones():
     with pytest.raises(InputError, match=r"memory=mamba: must be gru or lstm"):
-        find("memory", "mamba")
+        find_component("memory", "mamba")

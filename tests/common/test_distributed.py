@@ -98,14 +98,14 @@ def two(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_rows_and_draws_of_the_second_of_two(two: None):
     batch = torch.arange(8.0).reshape(4, 2)
-    assert torch.equal(distributed.local_rows(batch), batch)  # outside of a step
-    with distributed.share_batch():
-        assert torch.equal(distributed.local_rows(batch), batch[2:])
+    assert torch.equal(distributed.take_local_rows(batch), batch)  # outside of a step
+    with distributed.split_batch():
+        assert torch.equal(distributed.take_local_rows(batch), batch[2:])
         torch.manual_seed(3)
         rows = distributed.draw_rows(torch.rand_like, batch[2:])
     torch.manual_seed(3)
     assert torch.equal(rows, torch.rand_like(batch)[2:])
-    assert torch.equal(distributed.local_rows(batch), batch)
+    assert torch.equal(distributed.take_local_rows(batch), batch)
 
 
 def test_dropout_is_that_of_the_whole_batch(two: None):
@@ -113,7 +113,7 @@ def test_dropout_is_that_of_the_whole_batch(two: None):
     torch.manual_seed(1)
     expected = layer(batch)
     torch.manual_seed(1)
-    with distributed.share_batch():
+    with distributed.split_batch():
         assert torch.equal(layer(batch[3:]), expected[3:])
         assert torch.equal(layer.eval()(batch), batch)
 
@@ -151,8 +151,8 @@ def test_one_process_shares_nothing(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
     assert (distributed.world_size(), distributed.rank(), distributed.is_first()) == (1, 0, True)
     value = torch.rand(3)
-    with distributed.share_batch():
-        assert distributed.local_rows(value) is value
+    with distributed.split_batch():
+        assert distributed.take_local_rows(value) is value
         assert distributed.gather_rows(value) is value
         assert distributed.average(value) is value
     assert distributed.broadcast("a") == "a"

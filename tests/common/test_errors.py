@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from memmlp.common.errors import InputError, require, why_unreadable
+from memmlp.common.errors import InputError, describe_read_error, import_optional
 
 
 def test_a_message_is_one_line_whatever_is_in_it():
@@ -20,11 +20,11 @@ def test_a_message_is_one_line_whatever_is_in_it():
 def test_what_is_no_yaml_is_told_by_line_and_column(text: str, words: str):
     with pytest.raises(yaml.YAMLError) as error:
         yaml.safe_load(text)
-    assert words in why_unreadable(error.value)
-    assert "<unicode string>" not in why_unreadable(error.value)
+    assert words in describe_read_error(error.value)
+    assert "<unicode string>" not in describe_read_error(error.value)
 
 
 def test_a_missing_package_is_named_with_its_extra():
-    assert require("json.decoder", "plots", "--figure").JSONDecoder
+    assert import_optional("json.decoder", "plots", "--figure").JSONDecoder
     with pytest.raises(InputError, match=r"--figure: needs nowhere: pip install 'memmlp\[plots\]'"):
-        require("nowhere.at.all", "plots", "--figure")
+        import_optional("nowhere.at.all", "plots", "--figure")

@@ -29,7 +29,7 @@ from memmlp.common.lease import (
     current_process,
     is_alive,
     publish,
-    temporary,
+    temporary_path,
 )
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.run import Run
@@ -91,7 +91,7 @@ def test_this_process_is_alive_and_an_earlier_one_with_its_number_is_not(monkeyp
     here = current_process()
     assert is_alive(here) is True
     assert is_alive(here | {"born": "1"}) is False
-    monkeypatch.setattr(lease, "process_space", lambda: "elsewhere")
+    monkeypatch.setattr(lease, "process_namespace", lambda: "elsewhere")
     assert is_alive(here) is None
 
 
@@ -183,7 +183,7 @@ def test_a_folder_beside_its_lock(tmp_path: Path, clock: Clock):
     one.lock, two.lock = Lock(tmp_path, "data"), Lock(tmp_path, "data")
 
     def begin() -> Path:
-        unfinished = temporary(place)
+        unfinished = temporary_path(place)
         unfinished.mkdir()
         (unfinished / "half").touch()
         return unfinished
@@ -280,7 +280,7 @@ def test_a_folder_is_the_same_by_its_other_names(tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     with losing(Path("mine")):
         for path in (tmp_path / "link" / "a", Path("link/a"), Path("other/../mine/a")):
-            assert ".lease-1." in temporary(path).name
+            assert ".lease-1." in temporary_path(path).name
             with pytest.raises(LeaseLost):
                 publish(tmp_path / "none", path)
 
@@ -289,8 +289,12 @@ def test_only_what_earlier_owners_left_unfinished_is_removed(tmp_path: Path):
     folder = tmp_path / "run"
     (folder / "evaluations").mkdir(parents=True)
     with taken(Lock(folder)):
-        left = [temporary(folder / "evaluations" / "a"), temporary(folder / "DONE"), temporary(folder)]
-    others = [temporary(folder / "notes"), folder / ".mine.tmp"]
+        left = [
+            temporary_path(folder / "evaluations" / "a"),
+            temporary_path(folder / "DONE"),
+            temporary_path(folder),
+        ]
+    others = [temporary_path(folder / "notes"), folder / ".mine.tmp"]
     for path in (*left, *others):
         path.touch()
     with taken(Lock(folder)):

@@ -58,41 +58,44 @@ def serve(folder: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> Path
 def test_it_is_fetched_once_and_read_member_by_member(package, place, monkeypatch):
     pinned, content = package
     source = serve(place, content, monkeypatch)
-    assert npm.read(pinned, ["dist/a.js", "dist/b.js"]) == {"dist/a.js": b"let a;", "dist/b.js": b"let b;"}
+    assert npm.read_package_files(pinned, ["dist/a.js", "dist/b.js"]) == {
+        "dist/a.js": b"let a;",
+        "dist/b.js": b"let b;",
+    }
     source.unlink()
-    assert npm.read(pinned, ["package.json"]) == {"package.json": b"{}"}
+    assert npm.read_package_files(pinned, ["package.json"]) == {"package.json": b"{}"}
     assert [path.name for path in (place / "cache" / "memmlp" / "npm").iterdir()] == ["scope-name-1.2.3.tgz"]
     with pytest.raises(KeyError, match=r"@scope/name@1.2.3 does not have dist/c.js"):
-        npm.read(pinned, ["dist/a.js", "dist/c.js"])
+        npm.read_package_files(pinned, ["dist/a.js", "dist/c.js"])
 
 
 def test_another_file_is_refused_and_not_kept(package, place, monkeypatch):
     pinned, _ = package
     serve(place, packed({"package/dist/a.js": b"evil"}), monkeypatch)
-    with pytest.raises(InputError, match=r"^@scope/name@1.2.3: the npm registry sent another file"):
-        npm.tarball(pinned)
-    assert not list(npm.cache().glob("*"))
+    with pytest.raises(InputError, match=r"^@scope/name@1.2.3: the file from the npm registry"):
+        npm.fetch_tarball(pinned)
+    assert not list(npm.cache_folder().glob("*"))
 
 
 def test_a_folder_of_tarballs_comes_first(package, place, monkeypatch):
     pinned, content = package
     monkeypatch.setenv(npm.FOLDER, str(place / "given"))
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", (place / "nothing").as_uri())
-    with pytest.raises(InputError, match=r"cannot be fetched .*MEMMLP_NPM.*scope-name-1.2.3.tgz"):
-        npm.tarball(pinned)
+    with pytest.raises(InputError, match=r"cannot be downloaded .*MEMMLP_NPM.*scope-name-1.2.3.tgz"):
+        npm.fetch_tarball(pinned)
     (place / "given").mkdir()
     file = place / "given" / "scope-name-1.2.3.tgz"
     file.write_bytes(content)
-    assert npm.tarball(pinned) == file
+    assert npm.fetch_tarball(pinned) == file
     file.write_bytes(content[1:])
-    with pytest.raises(InputError, match=r"scope-name-1.2.3.tgz: not @scope/name@1.2.3 as pinned"):
-        npm.tarball(pinned)
+    with pytest.raises(InputError, match=r"scope-name-1.2.3.tgz: must be @scope/name@1.2.3"):
+        npm.fetch_tarball(pinned)
 
 
 @pytest.mark.parametrize("address", ["http://127.0.0.1:9/", "no address"])
 def test_a_registry_out_of_reach_is_one_line(package, address, monkeypatch):
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", address)
     with pytest.raises(InputError) as told:
-        npm.tarball(package[0])
-    assert str(told.value).startswith("@scope/name@1.2.3: cannot be fetched from the npm registry (")
+        npm.fetch_tarball(package[0])
+    assert str(told.value).startswith("@scope/name@1.2.3: cannot be downloaded from the npm registry (")
     assert "npm pack @scope/name@1.2.3" in str(told.value)

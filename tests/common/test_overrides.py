@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from memmlp.common.overrides import Override, last_by_key
+from memmlp.common.overrides import Override, select_last_by_key
 
 
 @pytest.mark.parametrize(
@@ -31,4 +31,4 @@ def test_the_options_that_an_override_names(text: str, options: list[str]):
 
 
 def test_the_last_override_of_a_key_wins_at_the_first_ones_place():
-    assert [str(one) for one in last_by_key(["a=1", "b=2", "+a=3"]).values()] == ["+a=3", "b=2"]
+    assert [str(one) for one in select_last_by_key(["a=1", "b=2", "+a=3"]).values()] == ["+a=3", "b=2"]

@@ -8,7 +8,7 @@ from urllib.parse import quote
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.common.page_server import COOKIE, Access, check_token, is_loopback
+from memmlp.common.page_server import COOKIE, AccessRules, check_token, is_loopback
 
 TOKEN = "a token of many letters"
 
@@ -27,7 +27,7 @@ def headers(**given: str) -> Message:
 )
 def test_which_addresses_are_this_machine_s_alone(host: str, alone: bool):
     assert is_loopback(host) is alone
-    assert (Access(host).token is None) is alone
+    assert (AccessRules(host).token is None) is alone
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_which_addresses_are_this_machine_s_alone(host: str, alone: bool):
     ],
 )
 def test_this_machine_s_own_address(given: dict[str, str], allowed: bool):
-    assert Access("127.0.0.1").allows("/events", headers(**given), 8765) is allowed
+    assert AccessRules("127.0.0.1").allows("/events", headers(**given), 8765) is allowed
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_this_machine_s_own_address(given: dict[str, str], allowed: bool):
 )
 def test_another_address_needs_the_token(path: str, cookie: str, allowed: bool):
     asked = headers(Host="192.168.1.5:8765", **({"Cookie": cookie} if cookie else {}))
-    assert Access("192.168.1.5", TOKEN).allows(path, asked, 8765) is allowed
+    assert AccessRules("192.168.1.5", TOKEN).allows(path, asked, 8765) is allowed
 
 
 @pytest.mark.parametrize(
@@ -71,11 +71,11 @@ def test_another_address_needs_the_token(path: str, cookie: str, allowed: bool):
 def test_only_the_page_itself_changes_something(origin: str | None, allowed: bool):
     """A page of another site can send a form here, with the browser's cookies."""
     given = headers(Host="localhost:8765", **({"Origin": origin} if origin else {}))
-    assert Access("127.0.0.1").allows_change("/wearer", given, 8765) is allowed
+    assert AccessRules("127.0.0.1").allows_change("/wearer", given, 8765) is allowed
 
 
 def test_a_new_token_is_long_and_another_each_time():
-    first, second = Access("0.0.0.0").token, Access("0.0.0.0").token
+    first, second = AccessRules("0.0.0.0").token, AccessRules("0.0.0.0").token
     assert first != second
     assert len(first or "") >= 32
 

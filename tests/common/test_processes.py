@@ -12,9 +12,9 @@ import pytest
 
 import memmlp
 from memmlp.common.processes import (
+    build_import_variables,
     finish_uninterrupted,
-    import_environment,
-    termination_interrupts,
+    treat_termination_as_interrupt,
 )
 
 FILE = "import memmlp; print(memmlp.__file__)"
@@ -38,7 +38,7 @@ def found(**environment: str) -> str:
 
 
 def test_a_import_environment_the_same_package(foreign: Path):
-    assert found(**import_environment()) == memmlp.__file__
+    assert found(**build_import_variables()) == memmlp.__file__
 
 
 def test_an_end_that_has_begun_is_not_interrupted():
@@ -58,6 +58,6 @@ def test_an_end_that_has_begun_is_not_interrupted():
 
 def test_a_request_to_end_is_a_ctrl_c():
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), termination_interrupts():
+    with pytest.raises(KeyboardInterrupt), treat_termination_as_interrupt():
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) == before

@@ -8,10 +8,10 @@ import pytest
 
 from memmlp.common import progress
 from memmlp.common.progress import (
-    announce_to,
     label_progress,
     notify,
     progress_bar,
+    send_announcements_to,
     show_progress,
 )
 
@@ -20,11 +20,11 @@ from memmlp.common.progress import (
 def test_a_remark_is_shown_on_a_terminal_too(capsys, monkeypatch: pytest.MonkeyPatch, terminal):
     monkeypatch.setattr("sys.stderr.isatty", lambda: terminal, raising=False)
     notify("data: before")
-    with announce_to():
+    with send_announcements_to():
         notify("data: 1 file was skipped")
     assert capsys.readouterr().err == "data: 1 file was skipped\n"
     told: list[str] = []
-    with announce_to(told.append):
+    with send_announcements_to(told.append):
         notify("data: 1 file was skipped")
     assert told == ["data: 1 file was skipped"]
 
@@ -32,7 +32,7 @@ def test_a_remark_is_shown_on_a_terminal_too(capsys, monkeypatch: pytest.MonkeyP
 def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
-    with announce_to(told.append), show_progress("network", 4000, done=398) as count:
+    with send_announcements_to(told.append), show_progress("network", 4000, done=398) as count:
         count.advance()
         count.set_note("loss 2.31")
         count.advance()
@@ -43,7 +43,7 @@ def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
 def test_a_line_names_the_unit_and_the_stage(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
-    with announce_to(told.append):
+    with send_announcements_to(told.append):
         with label_progress("validation"):
             list(progress_bar(iter("a"), "stream", unit="frames"))
         list(progress_bar(iter("a"), "stream", unit="frames"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.common.settings import clip_folders, each, existing, one_of, setting, sized, text, within
+from memmlp.common.settings import each, existing, existing_clip_folders, one_of, setting, sized, text, within
 
 
 @pytest.mark.parametrize(
@@ -33,9 +33,9 @@ def test_paths_must_exist(tmp_path: Path):
     assert existing("file").allows(str(tmp_path / "file"))
     assert existing("file", "builtin").allows("builtin")
     assert not existing("folder").allows(str(tmp_path / "file"))
-    assert clip_folders().allows([str(tmp_path)])
-    assert not clip_folders().allows([str(tmp_path), str(tmp_path)])
-    assert not clip_folders().allows([])
+    assert existing_clip_folders().allows([str(tmp_path)])
+    assert not existing_clip_folders().allows([str(tmp_path), str(tmp_path)])
+    assert not existing_clip_folders().allows([])
 
 
 def test_defaults_are_chosen_by_the_profile():

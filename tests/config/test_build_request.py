@@ -9,7 +9,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from memmlp.common.components import declared, find
+from memmlp.common.components import collect_components, find_component
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
 from memmlp.config.build_request import build_motion
@@ -153,6 +153,6 @@ def test_a_run_on_a_mix_is_restored():
 
 def test_another_version_of_a_generator_makes_other_motion(monkeypatch: pytest.MonkeyPatch):
     before = build_motion(composed(["profile=tiny"])).clips.root
-    newer = replace(find("generator", "puppet"), version=7)
-    monkeypatch.setitem(declared(), ("generator", "puppet"), newer)
+    newer = replace(find_component("generator", "puppet"), version=7)
+    monkeypatch.setitem(collect_components(), ("generator", "puppet"), newer)
     assert build_motion(composed(["profile=tiny"])).clips.root == before.with_name(f"{before.name}-v7")

@@ -9,7 +9,7 @@ from conftest import Memmlp, one_line
 from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.common.components import SLOTS, names
+from memmlp.common.components import SLOTS, list_component_names
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import _hydra, composed, parse, preflight
 from memmlp.config.plugins import packaged
@@ -33,7 +33,7 @@ def test_every_option_composes_and_passes(tmp_path: Path):
         **{f"loss={name}": ["model=agrol_mlp"] for name in (*OF_TERMS, "agrol", "rpm", "terms")},
         **{f"predictor={name}": ["hand=fk"] for name in ("rotation_only", "rotation_only_memory")},
     }
-    options = [f"{slot}={name}" for slot in SLOTS for name in names(slot)]
+    options = [f"{slot}={name}" for slot in SLOTS for name in list_component_names(slot)]
     for group in ("data", "experiment", "loggers", "loss", "profile"):
         options += [f"{group}={path.stem}" for path in (packaged("conf") / group).glob("*.yaml")]
     assert len(options) > 60

@@ -27,8 +27,8 @@ from memmlp.config.plugins import DEFAULT_GROUPING, grouping_to_choose
 from memmlp.config.schema import restored
 from memmlp.report.tables.table_text import make_heading
 from memmlp.runs import environment
-from memmlp.runs.environment import user_packages
-from memmlp.runs.identity import evaluation_id, evaluation_settings
+from memmlp.runs.environment import describe_user_packages
+from memmlp.runs.identity import compute_evaluation_id, select_evaluation_settings
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import parse_search
 
@@ -47,7 +47,7 @@ def write(folder: Path, files: dict[str, str]) -> None:
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-    environment._user_code.cache_clear()  # as in a process that starts now
+    environment._read_user_code.cache_clear()  # as in a process that starts now
 
 
 @pytest.mark.parametrize("how", ["overrides", "environment", "entry point"])
@@ -84,7 +84,11 @@ def test_keys_of_a_custom_component_are_checked(on_path: Path):
 
 
 def raise_version(monkeypatch: pytest.MonkeyPatch, slot: str, name: str) -> None:
-    monkeypatch.setitem(components.declared(), (slot, name), replace(components.find(slot, name), version=2))
+    monkeypatch.setitem(
+        components.collect_components(),
+        (slot, name),
+        replace(components.find_component(slot, name), version=2),
+    )
 
 
 def test_an_experiment_knows_packages_and_versions(on_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -103,12 +107,14 @@ def test_an_experiment_knows_packages_and_versions(on_path: Path, monkeypatch: p
 def test_custom_metrics_make_another_evaluation(on_path: Path, monkeypatch: pytest.MonkeyPatch):
     config = build_experiment(composed(OWN)).config
     without = {**config, "evaluation": {**config["evaluation"], "metrics": []}}
-    assert evaluation_settings(config, "stream")["metrics"] == {"FootSkate": f"{PACKAGE}.metrics.foot_skate"}
-    assert "metrics" not in evaluation_settings(without, "stream")
-    before = evaluation_id(config, "stream")
-    assert before != evaluation_id(without, "stream")
+    assert select_evaluation_settings(config, "stream")["metrics"] == {
+        "FootSkate": f"{PACKAGE}.metrics.foot_skate"
+    }
+    assert "metrics" not in select_evaluation_settings(without, "stream")
+    before = compute_evaluation_id(config, "stream")
+    assert before != compute_evaluation_id(without, "stream")
     raise_version(monkeypatch, "metric", "FootSkate")
-    assert evaluation_id(config, "stream") != before
+    assert compute_evaluation_id(config, "stream") != before
 
 
 def test_a_loss_has_the_term_with_its_weight(on_path: Path):
@@ -315,7 +321,7 @@ def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
     write(folder, {"mine.py": "A = 1\n"})
     plugins.activate(["mine"])
     run = Run(folder / "run")
-    run.begin("memmlp", {}, data="d", prerequisite=None, plugins=user_packages(["mine"]))
+    run.begin("memmlp", {}, data="d", prerequisite=None, plugins=describe_user_packages(["mine"]))
     write(folder, {"mine.py": "A = 22\n"})
     assert run.changed_sources == ["mine:mine.py"]
     assert "mine" not in sys.modules

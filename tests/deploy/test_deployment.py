@@ -138,9 +138,9 @@ def test_a_deployment_in_fp16_and_an_older_opset(small_yardstick, tmp_path):
     grown = [cost["fp16"][name] / cost["fp32"][name] - 1 for name in ("MPJPE", "position MPJPE")]
     assert cost["growth"] == pytest.approx(max(grown))
     assert cost["jitter_growth"] == pytest.approx(cost["fp16"]["Jitter"] / cost["fp32"]["Jitter"] - 1)
-    assert cost["onnx_bytes"] == place.file("fp16").stat().st_size
+    assert cost["onnx_bytes"] == place.onnx_path("fp16").stat().st_size
     assert cost["median_ms"] > 0
-    for path in (place.onnx, place.file("fp16")):
+    for path in (place.onnx, place.onnx_path("fp16")):
         assert [one.version for one in onnx.load(path).opset_import] == [15]
     place.finish({"run": "0" * 16, "settings": {}, **record})
     assert 0 < record["alone_median_ms"] <= record["alone_p95_ms"]

@@ -43,7 +43,9 @@ def node(folder: Path) -> Command:
     if shutil.which("node") is None:
         pytest.skip("node is not installed")
     try:
-        files = npm.read(npm.ONNXRUNTIME_WEB, ["package.json", *(f"dist/{name}" for name in FILES)])
+        files = npm.read_package_files(
+            npm.ONNXRUNTIME_WEB, ["package.json", *(f"dist/{name}" for name in FILES)]
+        )
     except InputError as error:
         pytest.skip(str(error))
     for name, content in files.items():

@@ -82,7 +82,7 @@ def test_a_search_under_kills_has_every_trial_once(tmp_path: Path, monkeypatch: 
 def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:
     run = Run.from_id(outputs, name * 16)
     run.begin("memmlp", {}, data="d", prerequisite=None)
-    run.want([])  # no evaluation and no export
+    run.request_stages([])  # no evaluation and no export
     run.model.write_bytes(weights)
     run.finish(["model.safetensors"])
     return run

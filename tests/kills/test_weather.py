@@ -19,7 +19,7 @@ from memmlp.common import lease
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.report.tables.measured_run import load
-from memmlp.runs.evaluation_file import intact, write_report
+from memmlp.runs.evaluation_file import is_intact, write_report
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.search.director import objectives
@@ -121,7 +121,7 @@ def sound(run: Run) -> bool:
     """Whether all files of a run are whole, so that it can be resumed."""
     assert [entry.values for entry in run.metrics()] == [{"loss": 1 / (n + 1)} for n in range(run.step)]
     assert not run.done or run.verify() == []
-    assert all(map(intact, run.evaluations.glob("*.json")))
+    assert all(map(is_intact, run.evaluations.glob("*.json")))
     return not list(run.folder.rglob(".*.tmp"))
 
 
@@ -136,10 +136,10 @@ def error_of(action: Callable[[], object]) -> Exception | None:
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Records are small."""
-    monkeypatch.setattr("memmlp.runs.environment.code_files", lambda packages: {"a.py": b"0"})
-    monkeypatch.setattr("memmlp.runs.run.changes", lambda: "")
+    monkeypatch.setattr("memmlp.runs.environment.read_code_files", lambda packages: {"a.py": b"0"})
+    monkeypatch.setattr("memmlp.runs.run.create_code_patch", lambda: "")
     for module in ("run", "evaluation_file", "deployment_folder"):
-        monkeypatch.setattr(f"memmlp.runs.{module}.environment", lambda: {"host": "h"})
+        monkeypatch.setattr(f"memmlp.runs.{module}.describe_environment", lambda: {"host": "h"})
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 import tiny
 import torch
 
-from memmlp.common.components import find
+from memmlp.common.components import find_component
 from memmlp.common.errors import InputError
 from memmlp.deploy.latency import count_macs
 from memmlp.deploy.onnx_stream import OnnxStream
@@ -29,7 +29,7 @@ from memmlp.networks.streaming import has_stream, streaming
 
 def without_blocks() -> MemMLP:
     """Make a network with branches that have no blocks."""
-    head = find("predictor", TwoBranchSettings.name).build({"depth": 0}, **tiny.SIZES)
+    head = find_component("predictor", TwoBranchSettings.name).build({"depth": 0}, **tiny.SIZES)
     return MemMLP(tiny.normalizer(), tiny.memory(), head, depth=tiny.DEPTH, **tiny.SIZES).eval()
 
 

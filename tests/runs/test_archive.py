@@ -76,26 +76,26 @@ def test_it_arrives_as_it_was_without_checkpoint_and_strange_files(run: Run, arc
 def test_what_a_run_lacks_that_is_there_already_is_named(run: Run, archive: Path, tmp_path: Path):
     """It is not taken in: results of one run are never mixed of two machines without a word."""
     told: list[str] = []
-    there, _ = import_run(archive, tmp_path / "there", tell=told.append)
-    import_run(archive, tmp_path / "there", tell=told.append)
+    there, _ = import_run(archive, tmp_path / "there", report=told.append)
+    import_run(archive, tmp_path / "there", report=told.append)
     assert told == []
     report = {"name": "window-1", "run": NAME, "mode": "window", "settings": {"mode": "window"}}
     write_report(run.evaluation("window-1"), report | {"mean": {"rotation": {"MPJPE": 4.0}}, "clips": []})
     place = run.deployment("int8-0")
     place.folder.mkdir()
-    place.file("int8").write_bytes(b"onnx")
+    place.onnx_path("int8").write_bytes(b"onnx")
     place.finish({"settings": {}})
     export_run(run, archive)
     before = sorted(there.folder.rglob("*"))
-    assert not import_run(archive, tmp_path / "there", tell=told.append)[1]
+    assert not import_run(archive, tmp_path / "there", report=told.append)[1]
     assert sorted(there.folder.rglob("*")) == before
     (line,) = told
-    assert f"has deployments/int8-0, evaluations/window-1.json, which is not added to run {NAME}" in line
+    assert f"contains deployments/int8-0, evaluations/window-1.json; not added, since run {NAME}" in line
 
 
 def test_only_a_finished_and_unchanged_run_leaves(run: Run, tmp_path: Path):
     run.model.write_bytes(b"other")
-    with pytest.raises(InputError, match=r"changed since it was made: model\.safetensors"):
+    with pytest.raises(InputError, match=r"missing or changed files: model\.safetensors"):
         export_run(run, tmp_path / "x.zip")
     run.marker.unlink()
     with pytest.raises(InputError, match="must be finished"):
@@ -104,21 +104,21 @@ def test_only_a_finished_and_unchanged_run_leaves(run: Run, tmp_path: Path):
 
 
 def test_another_file_than_was_exported_is_refused(archive: Path, tmp_path: Path):
-    with pytest.raises(InputError, match="its SHA-256 is"):
+    with pytest.raises(InputError, match="must have the SHA-256"):
         import_run(archive, tmp_path / "there", "0" * 64)
-    refused(archive, tmp_path / "there", "--max-gb", largest=5)
+    refused(archive, tmp_path / "there", "--max-gb", max_size=5)
 
 
 def test_changed_files_are_refused(archive: Path, tmp_path: Path):
     whole, there = archive.read_bytes(), tmp_path / "there"
     changed(archive, {"model.safetensors": b"WEIGHTS"})
-    refused(archive, there, "changed since it was made: model.safetensors")
+    refused(archive, there, "missing or changed files: model.safetensors")
     archive.write_bytes(whole)
     changed(archive, {"DONE": b"{}"})
-    refused(archive, there, "does not contain a finished run")
+    refused(archive, there, "must contain a finished run")
     archive.write_bytes(whole)
     changed(archive, {"manifest.json": b"{}"})
-    refused(archive, there, "does not contain a finished run")
+    refused(archive, there, "must contain a finished run")
 
 
 def test_no_other_name_is_unpacked(archive: Path, tmp_path: Path):
@@ -138,14 +138,14 @@ def test_an_archive_cut_anywhere_is_refused(archive: Path, tmp_path: Path):
     whole = archive.read_bytes()
     for length in range(0, len(whole), 97):
         archive.write_bytes(whole[:length])
-        refused(archive, tmp_path / "there", "not an archive")
+        refused(archive, tmp_path / "there", "must be an archive")
 
 
 def test_another_run_of_that_id_stays(run: Run, archive: Path, tmp_path: Path):
     place = Run.from_id(tmp_path / "there", NAME)
     place.begin("memmlp", {}, data="d", prerequisite=None)
     for _ in ("unfinished", "with other weights"):
-        with pytest.raises(InputError, match="exists already"):
+        with pytest.raises(InputError, match="already exists"):
             import_run(archive, tmp_path / "there")
         place.model.write_bytes(b"other")
         place.finish([place.model.name])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from memmlp.runs.deployment_folder import accurate_enough
+from memmlp.runs.deployment_folder import is_accurate_enough
 
 COSTS = [
     ({"growth": 0.01, "jitter_growth": 0.10}, True),
@@ -19,4 +19,4 @@ COSTS = [
 
 
 def test_jitter_counts_as_error_does():
-    assert [(cost, accurate_enough(cost)) for cost, _ in COSTS] == COSTS
+    assert [(cost, is_accurate_enough(cost)) for cost, _ in COSTS] == COSTS

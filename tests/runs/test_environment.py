@@ -10,14 +10,19 @@ import pytest
 
 from memmlp.common.files import file_digest
 from memmlp.runs import environment as module
-from memmlp.runs.environment import environment, prerequisite_origins, prerequisite_versions, user_packages
+from memmlp.runs.environment import (
+    collect_prerequisite_versions,
+    describe_environment,
+    describe_user_packages,
+    list_prerequisite_origins,
+)
 from memmlp.runs.run import Run
 
 
 def test_environment_says_what_ran_without_the_machines_name():
     import platform
 
-    found = environment()
+    found = describe_environment()
     assert {"version", "git", "python", "packages", "platform", "cpu", "cores", "host"} == set(found)
     assert found["packages"]["torch"].startswith("2.")
     assert platform.node() not in json.dumps(found)
@@ -29,24 +34,27 @@ def test_code_that_is_edited_while_it_runs_is_recorded_as_it_runs(
     """A worker does many runs with what it imported, whatever its files say later."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lab_of_mine.py").write_text("A = 1\n")
-    before = user_packages(["lab_of_mine"])
+    before = describe_user_packages(["lab_of_mine"])
     (tmp_path / "lab_of_mine.py").write_text("A = 2\n")
-    assert user_packages(["lab_of_mine"]) == before
+    assert describe_user_packages(["lab_of_mine"]) == before
 
 
 def test_a_file_is_parsed_only_if_its_bytes_differ(monkeypatch: pytest.MonkeyPatch):
     files = {name: b"A = 1" for name in ("same.py", "comment.py", "changed.py", "mixed.py")}
-    monkeypatch.setattr(module, "code_files", lambda packages: files)
+    monkeypatch.setattr(module, "read_code_files", lambda packages: files)
     manifest = module.describe_sources()
     manifest["sources"] |= {"mixed.py": module.MIXED, "gone.py": "0" * 12}
     files |= {"comment.py": b"A = 1  # one", "changed.py": b"A = 2", "new.py": b"B = 1"}
     parsed: list[bytes] = []
-    digest = module.code_digest
-    monkeypatch.setattr(module, "code_digest", lambda code: parsed.append(code) or digest(code))
-    assert module.changed_since(manifest) == ["changed.py", "mixed.py"]
+    digest = module.compute_code_digest
+    monkeypatch.setattr(module, "compute_code_digest", lambda code: parsed.append(code) or digest(code))
+    assert module.list_changed_files(manifest) == ["changed.py", "mixed.py"]
     assert sorted(parsed) == [b"A = 1", b"A = 1  # one", b"A = 2"]  # of mixed.py, comment.py and changed.py
-    assert module.changed_since({"sources": manifest["sources"]}) == ["changed.py", "mixed.py"]  # older runs
-    assert module.changed_since({}) == []
+    assert module.list_changed_files({"sources": manifest["sources"]}) == [
+        "changed.py",
+        "mixed.py",
+    ]  # older runs
+    assert module.list_changed_files({}) == []
 
 
 def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -56,15 +64,15 @@ def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.Mo
         author = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
         subprocess.run(["git", "-C", str(tmp_path), *author, *words], check=True)
     monkeypatch.setattr(module, "PACKAGE", tmp_path)
-    cached = (module._git, module.changes)
+    cached = (module._describe_commit, module.create_code_patch)
     try:
         for one in cached:
             one.cache_clear()
         (tmp_path / "__init__.py").write_text("A = 2\n")
-        patch = module.changes()
+        patch = module.create_code_patch()
         assert "+A = 2" in patch
         (tmp_path / "__init__.py").write_text("A = 3\n")
-        assert module.changes() == patch
+        assert module.create_code_patch() == patch
     finally:
         for one in cached:
             one.cache_clear()
@@ -76,7 +84,7 @@ CODES, PART, NETWORK = (letter * 16 for letter in "abc")
 def trained(outputs: Path, name: str, prerequisite: Run | None = None, weights: str = "w", **facts) -> Run:
     run = Run.from_id(outputs, name)
     above = (
-        {"prerequisite_runs": prerequisite_origins(prerequisite.manifest, prerequisite.weights_digest)}
+        {"prerequisite_runs": list_prerequisite_origins(prerequisite.manifest, prerequisite.weights_digest)}
         if prerequisite
         else {}
     )
@@ -93,7 +101,7 @@ def test_what_a_run_builds_upon_stays_known_when_that_is_trained_again(tmp_path:
     digest, before = file_digest(codes.model), network.manifest["prerequisite_runs"]
     codes.reset()
     others = trained(tmp_path, CODES, weights="others")
-    assert prerequisite_origins(others.manifest, others.weights_digest)[0]["weights"] != digest
+    assert list_prerequisite_origins(others.manifest, others.weights_digest)[0]["weights"] != digest
     (found,) = network.manifest["prerequisite_runs"]
     assert [found] == before
     assert (found["id"], found["kind"], found["weights"]) == (CODES, "vqvae", digest)
@@ -106,14 +114,14 @@ def test_prerequisites_of_prerequisites_are_known(tmp_path: Path):
     part = trained(tmp_path, PART, codes, component_versions={"model.mem_mlp": 2})
     network = trained(tmp_path, NETWORK, part)
     assert [one["id"] for one in network.manifest["prerequisite_runs"]] == [PART, CODES]
-    assert prerequisite_versions(network.manifest) == {"vqvae": 1, "model.mem_mlp": 2}
+    assert collect_prerequisite_versions(network.manifest) == {"vqvae": 1, "model.mem_mlp": 2}
 
 
 def test_a_training_that_is_resumed_upon_other_weights_has_both(tmp_path: Path):
     network = Run.from_id(tmp_path, NETWORK)
     for weights in ("first", "first", "others"):
         codes = trained(tmp_path, CODES, weights=weights)
-        above = prerequisite_origins(codes.manifest, codes.weights_digest)
+        above = list_prerequisite_origins(codes.manifest, codes.weights_digest)
         network.begin("memmlp", {}, data="d", prerequisite=CODES, prerequisite_runs=above)
         network.checkpoint.touch()
     found = [one["weights"] for one in network.manifest["prerequisite_runs"]]
@@ -127,9 +135,9 @@ def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatc
 
     def begin(device: str, commit: str, dirty: bool, losses: str) -> dict:
         made = {"git": {"commit": commit, "dirty": dirty}, "cpu": "A"}
-        monkeypatch.setattr("memmlp.runs.run.environment", lambda: made)
+        monkeypatch.setattr("memmlp.runs.run.describe_environment", lambda: made)
         files = {"losses.py": losses.encode(), "ik.py": b"i"}
-        monkeypatch.setattr("memmlp.runs.environment.code_files", lambda packages: files)
+        monkeypatch.setattr("memmlp.runs.environment.read_code_files", lambda packages: files)
         run.begin("memmlp", {}, data="d", prerequisite=None, device=device, threads=2)
         return run.manifest
 

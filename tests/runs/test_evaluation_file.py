@@ -13,8 +13,8 @@ from memmlp.common.files import write_json
 from memmlp.report.tables.measured_run import load
 from memmlp.report.ui.run_index import read_facts
 from memmlp.runs.evaluation_file import EvaluationsAsConfigured, write_report
-from memmlp.runs.identity import evaluation_id_of
-from memmlp.runs.query import record
+from memmlp.runs.identity import hash_evaluation_settings
+from memmlp.runs.query import build_record
 from memmlp.runs.run import Run
 
 
@@ -25,7 +25,7 @@ def solved(run: Run, ik: str, value: float, iterations: int | None = None, made:
     clips = [{"name": "a", "frames": 60, **errors}]
     report = {"mode": "stream", "settings": settings, "mean": errors, "clips": clips, "made": made}
     run.evaluations.mkdir(exist_ok=True)
-    write_json(run.evaluation(evaluation_id_of(settings)), report)
+    write_json(run.evaluation(hash_evaluation_settings(settings)), report)
 
 
 def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
@@ -37,7 +37,7 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
 
     def found() -> tuple[dict, dict, dict, dict]:
         read = load(run.folder)
-        keys = {key: value for key, value in record(run).items() if "combined" in key}
+        keys = {key: value for key, value in build_record(run).items() if "combined" in key}
         return (
             run.results["stream"]["combined"],
             read.means["stream"]["combined"],
@@ -67,7 +67,7 @@ def test_a_mode_that_was_measured_by_an_earlier_recipe_says_so(tmp_path: Path, m
         "clips": [],
         "component_versions": {"mode.stream": 1},
     }
-    write_report(tmp_path / f"{evaluation_id_of(settings)}.json", report)
+    write_report(tmp_path / f"{hash_evaluation_settings(settings)}.json", report)
     monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "mode.stream", 1)
     assert EvaluationsAsConfigured(tmp_path, {}).outdated == {}
     monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "mode.stream", 2)
@@ -78,6 +78,6 @@ def test_a_damaged_file_is_named_by_what_reads_its_numbers(tmp_path: Path):
     write_json(tmp_path / "stream.json", {"mode": "stream"})
     found = EvaluationsAsConfigured(tmp_path, {})
     assert found.paths == [tmp_path / "stream.json"]
-    for read in (lambda: found.results, lambda: found.combined_by):
+    for read in (lambda: found.results, lambda: found.combined_solvers):
         with pytest.raises(InputError, match=r"stream\.json: cannot be read"):
             read()

@@ -8,7 +8,7 @@ import pytest
 
 from memmlp.common.files import write_json
 from memmlp.common.lease import current_process
-from memmlp.runs.garbage_runs import delete, garbage
+from memmlp.runs.garbage_runs import delete, find_garbage
 from memmlp.runs.identity import VERSIONS
 from memmlp.runs.lookup import add_tags, remove_tags
 from memmlp.runs.run import Run
@@ -47,7 +47,7 @@ def outputs(tmp_path: Path) -> Path:
 
 
 def found(outputs: Path, *kinds: str) -> dict[str, str]:
-    return {one.run.id: one.kind for one in garbage(outputs, *([kinds] if kinds else []))}
+    return {one.run.id: one.kind for one in find_garbage(outputs, *([kinds] if kinds else []))}
 
 
 def test_failed_old_and_orphaned_runs_may_go(outputs: Path):
@@ -65,7 +65,7 @@ def test_what_people_marked_or_somebody_is_at_or_a_run_builds_upon_stays(outputs
 
 def test_deleted_is_the_folder_and_no_other_unless_it_was_marked_meanwhile(outputs: Path):
     before = {path.name for path in (outputs / "runs").iterdir()}
-    (one,) = garbage(outputs, ["failed"])
+    (one,) = find_garbage(outputs, ["failed"])
     assert one.size > 0
     add_tags(one.run, ["keep"])
     assert not delete(one)

@@ -9,9 +9,9 @@ import memmlp.runs.identity
 from memmlp.runs.identity import (
     NEUTRAL,
     Identity,
-    changes_training,
-    deployment_id,
-    evaluation_id,
+    affects_training,
+    compute_deployment_id,
+    compute_evaluation_id,
 )
 
 
@@ -47,7 +47,7 @@ def test_a_stage_has_an_id_of_its_own_keys():
         for key, value in changes.items():
             group, name = key.split("__")
             config[group] = {**config.get(group, {}), name: value}
-        return identity(config), evaluation_id(config, "stream"), deployment_id(config)
+        return identity(config), compute_evaluation_id(config, "stream"), compute_deployment_id(config)
 
     def moved(**changes: object) -> list[bool]:
         return [a != b for a, b in zip(of(), of(**changes), strict=True)]
@@ -82,4 +82,4 @@ def test_equal_numbers_and_orders_are_one_identity():
 def test_keys_of_later_stages_and_neutral_keys_cannot_change_a_training():
     config = {**CONFIG, "evaluation": {"ik": "off"}, "loggers": {"mlflow": {"name": "mlflow"}}}
     keys = ("model.width", "model", "data.root", "optim.log_every", "evaluation.ik", "loggers")
-    assert [changes_training(key, config) for key in keys] == [True, True, True, False, False, False]
+    assert [affects_training(key, config) for key in keys] == [True, True, True, False, False, False]

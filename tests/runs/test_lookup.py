@@ -12,8 +12,8 @@ from memmlp.common.errors import InputError
 from memmlp.runs.lookup import (
     Notes,
     add_tags,
+    count_training_frames,
     find_run,
-    frames_seen,
     list_runs,
     notes_path,
     read_notes,
@@ -62,7 +62,9 @@ def test_a_refiner_saw_its_network_s_frames_and_its_own_pieces(tmp_path: Path):
     network = fake_run(tmp_path, "network", config=SEEN)
     above = {"prerequisite": network.id}
     config = SEEN | {"refiner": {"frames": 20}}
-    assert frames_seen(fake_run(tmp_path, "refiner", config=config, origin=above)) == 100 * 8 * (11 + 20)
+    assert count_training_frames(fake_run(tmp_path, "refiner", config=config, origin=above)) == 100 * 8 * (
+        11 + 20
+    )
 
 
 def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.runs.lookup import add_tags
-from memmlp.runs.query import as_typed, data_labels, differing, parse, record
+from memmlp.runs.query import build_record, format_typed_value, label_data, list_differing_keys, parse_query
 
 ONE = {
     "memory": "gru", "seed": 1, "optim.lr": 1e-3, "memory.layers": [2, 4], "stream.MPJPE": 6.25,
@@ -24,7 +24,7 @@ ONE = {
 
 
 def holds(text: str) -> bool:
-    return parse(text).test_records([ONE])[0]
+    return parse_query(text).test_records([ONE])[0]
 
 
 HOLDING = [
@@ -48,22 +48,23 @@ def test_conditions_hold_or_not():
 
 
 def test_what_a_run_does_not_have_is_neither_smaller_nor_larger():
-    assert parse("a<1 or a>=1").test_records([{"a": 0}, {"b": 0}]) == [True, False]
+    assert parse_query("a<1 or a>=1").test_records([{"a": 0}, {"b": 0}]) == [True, False]
 
 
 WRONG = [
-    ("", "a key is expected"), ("memory", "a comparison after memory"), ("memory=", "a value after memory="),
-    ("memory=gru or or seed=1", "'or' stands where a key"),
-    ("memory gru", "after memory comes 'gru'"),
-    ("status=running", "training, evaluating"), ("seed<many", "compares with a number"),
-    ("seed=<", "comes '<'"), ('note="open', "cannot be parsed"), ("memory=gru seed=1", "'seed' is not"),
+    ("", "expected a key"), ("memory", "a comparison after memory"), ("memory=", "a value after memory="),
+    ("memory=gru or or seed=1", "expected a key, but found 'or'"),
+    ("memory gru", "after memory, but found 'gru'"),
+    ("status=running", "training, evaluating"), ("seed<many", "expected a number"),
+    ("seed=<", "but found '<'"), ('note="open', "cannot be parsed"),
+    ("memory=gru seed=1", "but found 'seed'"),
 ]  # fmt: skip
 
 
 def test_what_is_no_condition_is_one_line():
     for text, words in WRONG:
         with pytest.raises(InputError) as error:
-            parse(text)
+            parse_query(text)
         assert words in str(error.value)
         assert str(error.value).startswith("--where '")
 
@@ -71,7 +72,7 @@ def test_what_is_no_condition_is_one_line():
 @given(st.text(alphabet='ab1.<>=!()" andort', max_size=30))
 def test_any_text_is_a_condition_or_one_line(text: str):
     with contextlib.suppress(InputError):
-        parse(text).condition(ONE)
+        parse_query(text).condition(ONE)
 
 
 @pytest.mark.parametrize("own", [float("nan"), "nan"])
@@ -79,23 +80,36 @@ def test_a_network_that_diverged_fulfils_no_comparison(own: float | str, tmp_pat
     """Files hold NaN as a word, which as a text is larger than any number."""
     one = measured(tmp_path, own)
     for text in ("<1", "<=1", ">1", ">=1", "=1", "=nan", "<nan", ">nan"):
-        assert parse(f"stream.MPJPE{text}").test_records([one]) == [False]
-    assert parse("stream.MPJPE!=1").test_records([one]) == [True]
+        assert parse_query(f"stream.MPJPE{text}").test_records([one]) == [False]
+    assert parse_query("stream.MPJPE!=1").test_records([one]) == [True]
     infinite = measured(tmp_path / "other", float("inf"))
-    assert [parse(f"stream.MPJPE{text}").test_records([infinite]) for text in (">1e300", "<6")] == [[True], [False]]
+    assert [parse_query(f"stream.MPJPE{text}").test_records([infinite]) for text in (">1e300", "<6")] == [
+        [True],
+        [False],
+    ]
 
 
 def measured(folder: Path, value: float | str) -> dict[str, Any]:
     """What may be asked of a run with that MPJPE."""
     run = begun(folder, {"seed": 0})
     write_json(run.results_path, {"stream": {"rotation": {"MPJPE": value}}})
-    return dict(record(run))
+    return dict(build_record(run))
 
 
 def test_a_number_equals_what_is_shown_of_it():
     for own in (0.000123456, 1234567.0, 6.51234, 3):
-        conditions = f"a={as_typed(own)}", f"a!={as_typed(own)}", f"a={own!r}", f"a={own * 1.01!r}"
-        assert [parse(text).test_records([{"a": own}])[0] for text in conditions] == [True, False, True, False]
+        conditions = (
+            f"a={format_typed_value(own)}",
+            f"a!={format_typed_value(own)}",
+            f"a={own!r}",
+            f"a={own * 1.01!r}",
+        )
+        assert [parse_query(text).test_records([{"a": own}])[0] for text in conditions] == [
+            True,
+            False,
+            True,
+            False,
+        ]
 
 
 def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):
@@ -103,9 +117,11 @@ def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):
     run = begun(tmp_path, config)
     write_json(run.results_path, {"stream": {"rotation": {"MPJPE": 6.5}, "position": {"MPJPE": 7.0}}})
     add_tags(run, ["good"])
-    one = record(run)
+    one = build_record(run)
     text = "memory=gru and memory.layers=[2] and stream.MPJPE=6.5 and stream.position.MPJPE=7 and tag=good"
-    assert parse(f"{text} and status=stopped and id={run.id} and stream.rotation.MPJPE<7").test_records([one]) == [True]
+    assert parse_query(f"{text} and status=stopped and id={run.id} and stream.rotation.MPJPE<7").test_records(
+        [one]
+    ) == [True]
 
 
 def test_times_are_those_of_the_file_that_was_asked_for(tmp_path: Path):
@@ -113,50 +129,50 @@ def test_times_are_those_of_the_file_that_was_asked_for(tmp_path: Path):
     latency = {"median_ms": 3.0, "pose_median_ms": 3.5, "settings": {"precision": "int8"}}
     latency["int8"] = {"median_ms": 1.0, "int8": {"MPJPE": 6.0}}
     write_json(run.results_path, {"latency": latency})
-    one = record(run)
+    one = build_record(run)
     assert (one["latency.median_ms"], one["latency.pose_median_ms"]) == (1.0, 3.5)
     assert (one["latency.int8.median_ms"], one["latency.int8.int8.MPJPE"]) == (1.0, 6.0)
     write_json(run.results_path, {"stream": {"rotation": {"MPJPE": 6.5}}})
-    assert not [key for key in record(run) if key.startswith("latency")]
+    assert not [key for key in build_record(run) if key.startswith("latency")]
 
 
 def test_the_keys_that_differ_without_neutral_ones():
     first = {"seed": 0, "paths": {"outputs": "a"}, "memory": {"name": "vq", "width": 5, "codes": 3}}
     second = {"seed": 0, "paths": {"outputs": "b"}, "memory": {"name": "gru", "width": 6}}
-    assert differing([first, second]) == ["memory", "memory.width"]
-    assert differing([first, first]) == []
+    assert list_differing_keys([first, second]) == ["memory", "memory.width"]
+    assert list_differing_keys([first, first]) == []
 
 
 def test_a_slots_keys_differ_where_runs_with_one_option_do():
     """One option's keys are told by its name, until two runs have that option with other values."""
     vq = {"memory": {"name": "vq", "layers": [2]}}
     none, other = {"memory": {"name": "none"}}, {"memory": {"name": "vq", "layers": [2, 4]}}
-    assert differing([vq, none]) == ["memory"]
-    assert differing([vq, none, other]) == ["memory", "memory.layers"]
+    assert list_differing_keys([vq, none]) == ["memory"]
+    assert list_differing_keys([vq, none, other]) == ["memory", "memory.layers"]
 
 
 def test_the_data_differs_where_its_digest_does_and_is_told_apart_by_its_name():
     first, second = ({"data": {"root": root, "weighting": "frames"}} for root in ("here", "/x/here"))
-    assert differing([first, second], ["d", "d"]) == []
-    assert differing([first, second], ["d", "e"]) == ["data.root"]
+    assert list_differing_keys([first, second], ["d", "d"]) == []
+    assert list_differing_keys([first, second], ["d", "e"]) == ["data.root"]
     data = [{"name": "synth", "seed": 1}, {"name": "mocap", "root": "x"}, {"name": "mocap", "root": "y"}]
     configs: list[dict[str, Any]] = [{"seed": i, "data": one} for i, one in enumerate(data)]
-    assert differing(configs[:2], "de") == ["seed"]
-    assert differing(configs, "def") == ["seed", "data.root"]
+    assert list_differing_keys(configs[:2], "de") == ["seed"]
+    assert list_differing_keys(configs, "def") == ["seed", "data.root"]
 
 
 def test_data_have_a_digest_only_where_two_have_one_name(tmp_path: Path):
     def one(digest: str, config: dict[str, Any]) -> dict[str, Any]:
         run = begun(tmp_path / digest / str(len(config)), config)
         run.write_manifest({"data": digest})
-        return record(run)
+        return build_record(run)
 
     synth, mocap, other = (
         one(digit * 64, {"data": {"name": name}})
         for digit, name in [("a", "synth"), ("b", "mocap"), ("c", "mocap")]
     )
     vqvae, unknown = one("a" * 64, {}), one("d" * 64, {})
-    assert data_labels([synth, vqvae, mocap]) == ["synth", "synth", "mocap"]
-    assert data_labels([synth, mocap, other]) == ["synth", "mocap bbbbbbbb", "mocap cccccccc"]
-    assert data_labels([unknown]) == ["dddddddd"]
-    assert parse("data=synth").test_records([synth, mocap]) == [True, False]
+    assert label_data([synth, vqvae, mocap]) == ["synth", "synth", "mocap"]
+    assert label_data([synth, mocap, other]) == ["synth", "mocap bbbbbbbb", "mocap cccccccc"]
+    assert label_data([unknown]) == ["dddddddd"]
+    assert parse_query("data=synth").test_records([synth, mocap]) == [True, False]

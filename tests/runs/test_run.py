@@ -15,15 +15,15 @@ from memmlp.common.files import write_json
 from memmlp.report.tables.measured_run import load
 from memmlp.report.ui.run_index import read_facts
 from memmlp.runs.deployment_folder import ONNX_FILES
-from memmlp.runs.evaluation_file import intact, write_report
+from memmlp.runs.evaluation_file import is_intact, write_report
 from memmlp.runs.identity import (
-    deployment_id,
-    deployment_id_of,
-    deployment_settings,
-    evaluation_id,
-    evaluation_settings,
+    compute_deployment_id,
+    compute_evaluation_id,
+    hash_deployment_settings,
+    select_deployment_settings,
+    select_evaluation_settings,
 )
-from memmlp.runs.query import record
+from memmlp.runs.query import build_record
 from memmlp.runs.run import Run
 
 
@@ -67,20 +67,20 @@ def test_changed_weights_and_deployments_are_refused_and_lost_ones_are_made_agai
     place = run.deployment("int8-0")
     assert (run.preferred_onnx, run.weights()) == (place.int8, run.model)
     place.int8.write_bytes(b"another network's")
-    with pytest.raises(InputError, match=r"int8\.onnx: not the file that was exported"):
+    with pytest.raises(InputError, match=r"int8\.onnx: changed since it was exported"):
         _ = run.preferred_onnx
     place.int8.unlink()
     assert not run.has("int8-0")
     assert run.preferred_onnx != place.onnx  # which would be used in its place in silence
     run.model.write_bytes(b"other")
-    with pytest.raises(InputError, match="not the weights that were trained"):
+    with pytest.raises(InputError, match="changed since the training"):
         run.weights()
 
 
 def deploy(run: Run, made: str, measured: dict, **export) -> None:
     """Add a deployment with those settings of `export`, made at that time."""
-    settings = deployment_settings({"export": {"graph": "auto", "precision": "fp32", **export}})
-    place = run.deployment(deployment_id_of(settings))
+    settings = select_deployment_settings({"export": {"graph": "auto", "precision": "fp32", **export}})
+    place = run.deployment(hash_deployment_settings(settings))
     place.folder.mkdir(parents=True)
     write_json(
         place.latency, {"run": run.id, "settings": settings, "made": made, "artifacts": {}, **measured}
@@ -97,7 +97,7 @@ def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, gr
     deploy(run, "2026-01-01", {"median_ms": 1.0, "onnx_bytes": 15})
     deploy(run, "2026-01-02", INTEGERS, precision="int8")
     deploy(run, "2026-01-03", {"median_ms": 5.0, "onnx_bytes": 14}, graph="naive")
-    one = record(run)
+    one = build_record(run)
     assert (one["latency.median_ms"], one["latency.onnx_bytes"]) == (1.0, 15)
     assert not [key for key in one if key.startswith("latency-")]
     assert load(run.folder).costs["ms"] == 1.0
@@ -112,14 +112,16 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     fp32 = {"export": {"graph": "naive", "precision": "fp32"}}
 
     def make(config: dict, value: float, graph: bytes) -> None:
-        settings = evaluation_settings(config, "stream")
+        settings = select_evaluation_settings(config, "stream")
         report = {"mode": "stream", "settings": settings, "mean": {"rotation": {"MPJPE": value}}, "clips": []}
-        write_report(run.evaluation(evaluation_id(config, "stream")), report)
-        place = run.deployment(deployment_id(config))
+        write_report(run.evaluation(compute_evaluation_id(config, "stream")), report)
+        place = run.deployment(compute_deployment_id(config))
         place.folder.mkdir(parents=True)
         for path in (place.onnx, *([place.int8] if graph == b"old" else [])):
             path.write_bytes(graph)
-        place.finish({"settings": deployment_settings(config), "int8": {"growth": 0.0, "jitter_growth": 0.0}})
+        place.finish(
+            {"settings": select_deployment_settings(config), "int8": {"growth": 0.0, "jitter_growth": 0.0}}
+        )
 
     with monkeypatch.context() as today:
         today.setitem(memmlp.runs.identity.VERSIONS, "metrics", 2)
@@ -144,7 +146,7 @@ def test_verify_names_what_changed(tmp_path: Path):
     place.onnx.write_bytes(b"graph")
     place.finish({})
     write_report(report, {"mode": "stream", "mean": {"rotation": {"MPJPE": math.nan}}, "clips": []})
-    assert intact(report)
+    assert is_intact(report)
     assert run.verify() == []
     (run.folder / "clips.json").write_text("{ }")
     (run.folder / "latency.json").unlink()
@@ -177,7 +179,7 @@ def test_cleared_stages_leave_no_file_of_any_precision(tmp_path: Path):
     """A file that stays would keep its folder, and seem to be of the next weights."""
     run = complete(tmp_path)
     for precision in ONNX_FILES:
-        run.deployment("int8-0").file(precision).touch()
+        run.deployment("int8-0").onnx_path(precision).touch()
     run.clear_stages()
     assert not run.deployments.exists()
     assert not run.evaluations.exists()
@@ -245,15 +247,15 @@ def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp
     run.model.write_bytes(b"weights")
     run.finish(["model.safetensors"])
     run.evaluations.mkdir()
-    run.want(["window-0", "stream-0"])
+    run.request_stages(["window-0", "stream-0"])
     for name, status in (("stream-0", "trained"), ("window-0", "done")):
         run.evaluation(name).write_text("{}")
         assert run.status == status
-    run.want(["window-0", "stream-1"])
+    run.request_stages(["window-0", "stream-1"])
     with run.lock():
         assert run.status == "trained"  # somebody holds it, at none of its stages
     assert run.status == "trained"
-    run.want(["window-0", "stream-0"])
+    run.request_stages(["window-0", "stream-0"])
     assert run.status == "done"
 
 

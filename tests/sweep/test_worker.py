@@ -18,7 +18,7 @@ from machines import Clock, apart
 from processes import PATIENCE, started, until
 
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.lease import Changes
+from memmlp.common.lease import ChangeTimer
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
@@ -235,7 +235,7 @@ def test_a_full_disk_is_no_runs_failure(tmp_path: Path, code: int):
 def test_a_controller_elsewhere_is_dead_once_it_has_not_been_seen_for_long(tmp_path: Path, monkeypatch):
     """Whatever its machine's clock says."""
     clock = Clock()
-    monkeypatch.setattr(worker, "_changes", Changes(clock))
+    monkeypatch.setattr(worker, "_changes", ChangeTimer(clock))
     path = saved(tmp_path, open=True)
     for moment in (0.0, 2e9, 1e9):
         os.utime(path, (moment, moment))

@@ -73,7 +73,7 @@ def test_a_killed_training_says_from_where_it_goes_on_and_counts_all_its_seconds
         return made
 
     said: list[str] = []
-    with progress.announce_to(said.append):
+    with progress.send_announcements_to(said.append):
         with pytest.raises(Kill):
             train(task(7), OPTIM, run, 0, "killed")
         assert not said

@@ -48,7 +48,7 @@ def test_a_run_leaves_everything(home):
         assert (run.folder / name).stat().st_size > 0
     assert run.preferred_deployment.done
     made = [path.stem for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
-    assert set(run.wanted) == set(made)
+    assert set(run.requested_stages) == set(made)
     assert set(run.results) == {"window", "stream", "latency"}
     assert {run.manifest[fact] for fact in ("partial", "divided", "resampled", "unusual")} == {None}
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
@@ -161,7 +161,7 @@ def test_changed_weights_are_not_evaluated_and_what_is_exported_is_checked_on_th
     weights = bytearray(copy.model.read_bytes())
     weights[-1] ^= 1
     copy.model.write_bytes(weights)
-    assert "not the weights that were trained" in command(home, "eval", str(copy.folder), "--again", code=2)
+    assert "changed since the training" in command(home, "eval", str(copy.folder), "--again", code=2)
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in packaged("conf/experiment").glob("*.yaml")))
@@ -223,5 +223,5 @@ def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: p
         assert run_stages.unmeasured(experiment, run) == []
         code.write_text("A = 2\n")
         assert run_stages.unmeasured(experiment, run) == []  # this process would measure them as before
-        environment._user_code.cache_clear()
+        environment._read_user_code.cache_clear()
         assert run_stages.unmeasured(experiment, run) == ["stream"]

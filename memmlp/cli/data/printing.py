@@ -11,7 +11,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from memmlp.common.errors import one_line
+from memmlp.common.errors import escape_line_breaks
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import INTERPOLATED, Skipped
 from memmlp.motion.preparing.find_clips import source_of
@@ -80,7 +80,9 @@ def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:
 
 def show_pairs(label: str, pairs: Mapping[str, str], sign: str = " = ") -> None:
     """Print the first few pairs of names, and the number of the others."""
-    show_some([f"{label}: {one_line(a)}{sign}{one_line(b)}" for a, b in pairs.items()], label)
+    show_some(
+        [f"{label}: {escape_line_breaks(a)}{sign}{escape_line_breaks(b)}" for a, b in pairs.items()], label
+    )
 
 
 def show_skipped(skipped: Sequence[Skipped]) -> None:

@@ -56,9 +56,9 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     `data`, `started`, `tag`, `note`.
     """
     from memmlp.runs import lookup
-    from memmlp.runs.query import parse
+    from memmlp.runs.query import parse_query
 
-    query = parse(where) if where else None
+    query = parse_query(where) if where else None
     runs = lookup.list_runs(outputs)
     if not runs:
         hint = "memmlp demo makes the first; --outputs FOLDER or MEMMLP_OUTPUTS names another folder"
@@ -103,10 +103,10 @@ def _outdated_lines(listed: Sequence[Run]) -> list[str]:
 
 def _hardly_trained_lines(listed: Sequence[Run]) -> list[str]:
     """Return a line that names the finished runs whose networks hardly saw motion, if there are any."""
-    from memmlp.runs.lookup import frames_seen, hardly_trained
+    from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
 
     networks = [run for run in listed if run.manifest.get("kind") == NETWORK and run.done]
-    ids = [run.id[:SHORT] for run in networks if hardly_trained(frames_seen(run))]
+    ids = [run.id[:SHORT] for run in networks if warn_if_hardly_trained(count_training_frames(run))]
     if not ids:
         return []
     names = "all finished runs" if len(ids) == len(networks) > 1 else _join(ids)
@@ -142,7 +142,7 @@ def _is_nan(value: object) -> bool:
 
 def _chosen_keys(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:
     """Return the keys to show: those asked for, or those of the config that differ between finished runs."""
-    from memmlp.runs.query import check_key, differing
+    from memmlp.runs.query import check_key, list_differing_keys
 
     if columns is not None:
         keys = [key.strip() for key in columns.split(",") if key.strip()]
@@ -151,7 +151,7 @@ def _chosen_keys(columns: str | None, records: Mapping[str, Record], listed: Seq
         return keys
     networks = [run for run in listed if records[run.id].get("kind") == NETWORK]
     data = [str(records[run.id].get("data_digest")) for run in networks]
-    return differing([run.config for run in networks], data) if len(networks) > 1 else []
+    return list_differing_keys([run.config for run in networks], data) if len(networks) > 1 else []
 
 
 def _print_table(records: Sequence[Record], keys: Sequence[str], asked: bool) -> list[str]:
@@ -174,11 +174,11 @@ def _print_table(records: Sequence[Record], keys: Sequence[str], asked: bool) ->
 
 def _columns(records: Sequence[Record], keys: Sequence[str], asked: bool) -> dict[str, list[str]]:
     """Return the texts of all columns by their heads."""
-    from memmlp.runs.query import data_labels
+    from memmlp.runs.query import label_data
 
     columns = {"run": [one["id"] for one in records]}
     columns |= {head: [str(one.get(head) or "-") for one in records] for head in ("status", "age")}
-    labels = data_labels(records)
+    labels = label_data(records)
     if not asked:
         columns["name"] = [str(one.get("name") or "-") for one in records]
         if len(set(labels) - {"-"}) > 1:

@@ -97,7 +97,7 @@ def diff(a: str, b: str, outputs: Path) -> None:
     Compared are the config keys that affect results, the data, the results, and code and machine. The change
     is B minus A.
     """
-    from memmlp.runs.lookup import find_run, frames_seen, hardly_trained
+    from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
 
     pair = first, second = find_run(outputs, a), find_run(outputs, b)
     ids, short = [run.id for run in pair], [run.id[:SHORT] for run in pair]
@@ -111,7 +111,7 @@ def diff(a: str, b: str, outputs: Path) -> None:
     else:
         click.echo("results: no difference")
     for run in pair:
-        if remark := hardly_trained(frames_seen(run)):
+        if remark := warn_if_hardly_trained(count_training_frames(run)):
             click.echo(f"run {run.id[:SHORT]}: {remark}")
     data = [run.manifest.get("data") for run in pair]
     if all(data) and data[0] != data[1]:
@@ -131,13 +131,13 @@ def _print_rows(table: Table, rows: list[tuple[str, ...]], wrapped: slice) -> No
 
 def _config_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
     """Return a row for each differing key of the config, or the data, that changes a result."""
-    from memmlp.runs.query import data_labels, differing
+    from memmlp.runs.query import label_data, list_differing_keys
 
     pair = [record_of(run) for run in (first, second)]
     digests = [str(one.get("data_digest")) for one in pair]
-    keys = differing([run.config for run in (first, second)], digests)
+    keys = list_differing_keys([run.config for run in (first, second)], digests)
     rows = [(key, *(value_text(one, key) for one in pair)) for key in keys]
-    return rows if len(set(digests)) == 1 else [("data", *data_labels(pair)), *rows]
+    return rows if len(set(digests)) == 1 else [("data", *label_data(pair)), *rows]
 
 
 def result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
@@ -158,12 +158,12 @@ def result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
 
 def _origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
     """Return a row for every difference in code and machine that may change numbers despite equal configs."""
-    from memmlp.runs.deployment_folder import timed_on
+    from memmlp.runs.deployment_folder import describe_timing_machine
     from memmlp.runs.identity import flatten
 
     a, b = (
         flatten({key: run.manifest.get(key) for key in ORIGIN})
-        | {"latency": timed_on(run.deployment_as_configured.record), **outdated_results(run)}
+        | {"latency": describe_timing_machine(run.deployment_as_configured.record), **outdated_results(run)}
         for run in (first, second)
     )
     return [
@@ -175,10 +175,10 @@ def _origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
 
 def record_of(run: Run) -> Record:
     """Return a run's record of values; of a run with a damaged file, only its id and status."""
-    from memmlp.runs.query import record
+    from memmlp.runs.query import build_record
 
     try:
-        return record(run)
+        return build_record(run)
     except InputError as error:
         click.echo(f"memmlp: warning: {error}", err=True)
         return {"id": run.id, "status": "damaged"}
@@ -186,22 +186,22 @@ def record_of(run: Run) -> Record:
 
 def value_text(record: Record, key: str, whole: bool = False) -> str:
     """Return a record's value as text; a long one is shortened unless the whole is wanted."""
-    from memmlp.runs.query import as_typed
+    from memmlp.runs.query import format_typed_value
 
-    text = as_typed(record[key]) if key in record else "-"
+    text = format_typed_value(record[key]) if key in record else "-"
     return text if whole or len(text) <= MAX_LENGTH else f"{text[:MAX_LENGTH]}…"
 
 
 def measured_numbers(run: Run) -> dict[str, Any]:
     """Return the numbers in a run's results by dotted key, with the names of inverse kinematics in these."""
-    from memmlp.runs.deployment_folder import with_times_as_deployed
+    from memmlp.runs.deployment_folder import replace_with_deployed_times
     from memmlp.runs.evaluation_file import name_solvers
     from memmlp.runs.identity import flatten
 
     results = name_solvers(run.results, run.evaluations_as_configured.combined_solvers)
     return {
         key: value
-        for key, value in flatten(with_times_as_deployed(results)).items()
+        for key, value in flatten(replace_with_deployed_times(results)).items()
         if isinstance(value, int | float) and not re.match(r"latency[^.]*\.(settings|made)", key)
     }
 

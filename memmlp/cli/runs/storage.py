@@ -60,9 +60,9 @@ def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
     These are failed runs, runs with older component versions, and orphans: a VQ-VAE that no run uses, or a
     folder without a run. Runs with a tag or a note, runs in progress, and runs that other runs need are kept.
     """
-    from memmlp.runs.garbage_runs import REASONS, delete, garbage
+    from memmlp.runs.garbage_runs import REASONS, delete, find_garbage
 
-    found = garbage(outputs, kinds or REASONS)
+    found = find_garbage(outputs, kinds or REASONS)
     if not found:
         click.echo("nothing to delete")
         return

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from memmlp.common import npm
-from memmlp.common.errors import InputError, why_unreadable
-from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, content_type, read_page_file
+from memmlp.common.errors import InputError, describe_read_error
+from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, find_content_type, read_page_file
 from memmlp.motion.formats.gltf import write_vrm
 
 QUEUED = 240  # the most frames that wait for a page; beyond, the oldest are dropped
@@ -52,7 +52,7 @@ def read_files(vrm: bytes | None = None) -> dict[str, bytes]:
     scripts = {
         f"npm/{name}": content
         for package, names in AVATAR_SCRIPTS.items()
-        for name, content in npm.read(package, names).items()
+        for name, content in npm.read_package_files(package, names).items()
     }
     return files | scripts | {"index.html": page, "avatar.vrm": vrm}
 
@@ -74,7 +74,7 @@ def read_vrm(path: Path) -> bytes:
         (size,) = struct.unpack_from("<I", content, 12)
         extensions = json.loads(content[20 : 20 + size]).get("extensions", {})
     except (OSError, ValueError, struct.error, AttributeError) as error:
-        raise InputError(f"--avatar {path}: {why_unreadable(error)}; expected a VRM file") from None
+        raise InputError(f"--avatar {path}: {describe_read_error(error)}; expected a VRM file") from None
     if not any(name in extensions for name in EXTENSIONS):
         raise InputError(f"--avatar {path}: a glTF file without a VRM avatar; expected a VRM file")
     return content
@@ -143,7 +143,7 @@ class LiveHandler(PageHandler):
         if name == "events":
             self.send_events(self.server.hub.events())
         elif name in self.server.files:
-            self.send(200, content_type(name), self.server.files[name])
+            self.send(200, find_content_type(name), self.server.files[name])
         else:
             self.send(404, TEXT, b"not found")
 

@@ -21,9 +21,9 @@ from onnx import numpy_helper
 from memmlp import __version__
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest, now, read_json
-from memmlp.common.lease import publish, temporary
-from memmlp.common.npm import ONNXRUNTIME_WEB, read
-from memmlp.common.page_server import read_page_file, security_policy
+from memmlp.common.lease import publish, temporary_path
+from memmlp.common.npm import ONNXRUNTIME_WEB, read_package_files
+from memmlp.common.page_server import build_security_policy, read_page_file
 from memmlp.common.progress import announce
 from memmlp.deploy.export import export
 from memmlp.deploy.latency import yardstick
@@ -147,12 +147,12 @@ class Site:
             InputError: if the folder holds something else, or ONNX Runtime can't be downloaded.
         """
         check_place(out)
-        unfinished = temporary(out)
+        unfinished = temporary_path(out)
         try:
             unfinished.mkdir(parents=True)
             self._fill(unfinished)
             total = sum(path.stat().st_size for path in _files(unfinished))
-            earlier = temporary(out)
+            earlier = temporary_path(out)
             if out.exists():
                 out.rename(earlier)
             publish(unfinished, out)
@@ -162,7 +162,7 @@ class Site:
         return total
 
     def _fill(self, folder: Path) -> None:
-        for name, content in read(ONNXRUNTIME_WEB, RUNTIME).items():
+        for name, content in read_package_files(ONNXRUNTIME_WEB, RUNTIME).items():
             _write(folder, RUNTIME[name], content)
         clips = [
             {"key": clip.key, "name": clip.name, "frames": clip.frames}
@@ -311,7 +311,7 @@ def _write_page(folder: Path) -> None:
         for name in names:
             _write(folder, name, read_page_file(package, name))
     index = (folder / "index.html").read_text("utf-8")
-    policy = security_policy(index, "'wasm-unsafe-eval'")
+    policy = build_security_policy(index, "'wasm-unsafe-eval'")
     _write(folder, "index.html", index.replace("POLICY", policy).encode())
     digests = {str(file.relative_to(folder).as_posix()): file_digest(file) for file in _files(folder)}
     version = hashlib.sha256(json.dumps(digests).encode()).hexdigest()[:16]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from memmlp.common.errors import InputError, why_unreadable
+from memmlp.common.errors import InputError, describe_read_error
 from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.formats.recording import END, Recording
 
@@ -78,7 +78,9 @@ def load_skeleton(which: str) -> SkeletonMap:
     try:
         content = yaml.load(path.read_text("utf-8"), _StrictLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: {why_unreadable(error)[:120]}; expected a readable YAML map") from error
+        raise InputError(
+            f"{path}: {describe_read_error(error)[:120]}; expected a readable YAML map"
+        ) from error
     return _parse(path, content)
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.lease import Lock, check_owner, publish, temporary
+from memmlp.common.lease import Lock, check_owner, publish, temporary_path
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FRAME_DIM, body_name, check_imported_body, load_rest_joints
 from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample
@@ -154,7 +154,7 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
     """Write the arrays under temporary names, then rename them, then write the manifest."""
     check_owner(out)
     (out / MANIFEST).unlink(missing_ok=True)
-    unfinished = {part: temporary(out / f"{part}.npy") for part in PARTS}
+    unfinished = {part: temporary_path(out / f"{part}.npy") for part in PARTS}
     try:
         _write_frames(source, rest, manifest, unfinished)
         if _request_digest(source, rest) != manifest.request:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from memmlp.common.errors import InputError, one_line
+from memmlp.common.errors import InputError, escape_line_breaks
 from memmlp.common.files import file_digest
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
@@ -88,7 +88,9 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
         except InputError as error:
             if strict:
                 raise
-            skipped.append(Skipped(one_line(file), str(error).removeprefix(one_line(f"{path}: "))))
+            skipped.append(
+                Skipped(escape_line_breaks(file), str(error).removeprefix(escape_line_breaks(f"{path}: ")))
+            )
             short += [name] if isinstance(error, TooShort) else []
         else:
             digests = file_digest(path), _content_digest(clip)
@@ -103,7 +105,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
 
 def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
     """Raise InputError unless the path is a regular file with a valid and new clip name."""
-    if one_line(file) != file:
+    if escape_line_breaks(file) != file:
         raise InputError(f"{path}: line feeds or other control characters in its name; rename it")
     if clip_name(file) in clips:
         raise InputError(f"{path}: {clips[clip_name(file)].file} has the same name; rename one of them")

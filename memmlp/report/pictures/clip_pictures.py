@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from memmlp.common.errors import InputError, require
+from memmlp.common.errors import InputError, import_optional
 from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, ROOT
@@ -153,9 +153,9 @@ def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUF
         raise InputError(f"{key} {path}: must end in {', '.join(suffixes)}")
     if not path.parent.is_dir():
         raise InputError(f"{key} {path}: there is no folder {path.parent}")
-    require("matplotlib", "plots", key)
+    import_optional("matplotlib", "plots", key)
     if path.suffix.lower() == ".mp4":
-        require("av", "video", key)
+        import_optional("av", "video", key)
 
 
 def write_picture(path: Path, piece: ClipPiece, poses: int = POSES, key: str = "path") -> None:
@@ -258,7 +258,7 @@ def encode_gif(pictures: Iterable[np.ndarray]) -> bytes:
 
 def encode_mp4(pictures: Iterable[np.ndarray]) -> bytes:
     """Encode pictures as H.264 in MP4; width and height must be even."""
-    av, buffer = require("av", "video", "MP4"), BytesIO()
+    av, buffer = import_optional("av", "video", "MP4"), BytesIO()
     frames = (av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24") for picture in pictures)
     with av.open(buffer, "w", format="mp4") as container:
         first = next(frames)

@@ -14,8 +14,8 @@ from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.report.tables.effects import RunsBySeed, list_comparisons, show_same_errors
 from memmlp.report.tables.measured_run import SHARED, UNKNOWN, Measured, find_core_share, select_undisturbed
 from memmlp.report.tables.table import STEADY
-from memmlp.runs.environment import changed, code_digests
-from memmlp.runs.lookup import hardly_trained
+from memmlp.runs.environment import compute_code_digests, list_differing_files
+from memmlp.runs.lookup import warn_if_hardly_trained
 from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
 
 DescribeRun = Callable[[Variant, int], str | None]
@@ -115,11 +115,15 @@ def flag_older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]
     """Flag runs that were made before code changed, though no component version was raised.
 
     Args:
-        runs: for each run its variant's label, the digests of its code (`code_digests`; empty where these are
-            not known), and the users' packages that it uses.
+        runs: for each run its variant's label, the digests of its code (`compute_code_digests`; empty where
+            these are not known), and the users' packages that it uses.
     """
-    current = functools.cache(code_digests)
-    found = [(label, changed(code, current(tuple(packages)))) for label, code, packages in runs if code]
+    current = functools.cache(compute_code_digests)
+    found = [
+        (label, list_differing_files(code, current(tuple(packages))))
+        for label, code, packages in runs
+        if code
+    ]
     names = sorted({name for _, files in found for name in files})
     if names:
         labels = join_quoted(label for label, files in found if files)
@@ -308,7 +312,7 @@ def _smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterat
 
 
 def _hardly_trained(every: Labelled) -> Iterator[str]:
-    found = [(label, hardly_trained(run.training.get("frames", 0.0))) for label, run in every]
+    found = [(label, warn_if_hardly_trained(run.training.get("frames", 0.0))) for label, run in every]
     for warning in drop_repeats(warning for _, warning in found if warning):
         labels = drop_repeats(label for label, one in found if one == warning)
         every_variant = len(labels) == len({label for label, _ in every})

@@ -16,10 +16,14 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.motion.preparing.groups import Grouping
-from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
-from memmlp.runs.environment import prerequisite_versions, recorded_prerequisites
-from memmlp.runs.evaluation_file import intact, keep_one_solver
-from memmlp.runs.lookup import frames_seen
+from memmlp.runs.deployment_folder import (
+    describe_timing_machine,
+    find_deployed_precision,
+    select_deployed_measurements,
+)
+from memmlp.runs.environment import collect_prerequisite_versions, get_recorded_prerequisites
+from memmlp.runs.evaluation_file import is_intact, keep_one_solver
+from memmlp.runs.lookup import count_training_frames
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import TIMES
 
@@ -245,13 +249,13 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployed = (deployments or [run.deployment_as_configured])[-1]
     latency = deployed.record
     origin = _evaluated(_with_prerequisites(_origin(manifest), run), reports)
-    origin = replace(origin, deployed=deployed_precision(latency))
+    origin = replace(origin, deployed=find_deployed_precision(latency))
     origin = replace(
         origin,
         component_versions={**origin.component_versions, **deployed.component_versions},
-        timed_on=timed_on(latency),
+        timed_on=describe_timing_machine(latency),
     )
-    seconds, frames = (manifest.get("seconds") or {}).get("train"), frames_seen(run)
+    seconds, frames = (manifest.get("seconds") or {}).get("train"), count_training_frames(run)
     training = {"seconds": float(seconds)} if seconds is not None else {}
     training |= {"frames": frames} if frames else {}
     costs, code = _costs(latency), _code(manifest)
@@ -280,7 +284,7 @@ def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:
 
 def _read(path: Path) -> dict[str, Any]:
     content = read_json(path)
-    if not content or ("digest" in content and not intact(path)):
+    if not content or ("digest" in content and not is_intact(path)):
         raise InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
     return content
 
@@ -291,7 +295,7 @@ def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
     Size and times are those of the file in the precision that was asked for; the network alone is timed in
     float32 only.
     """
-    measured = as_deployed(latency)
+    measured = select_deployed_measurements(latency)
 
     def of(name: str) -> float:
         return float(measured.get(name, np.nan))
@@ -339,19 +343,21 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
 
 
 def _code(manifest: Mapping[str, Any]) -> dict[str, str]:
-    own, *others = [one.get("sources") or {} for one in (manifest, *recorded_prerequisites(manifest))]
+    own, *others = [one.get("sources") or {} for one in (manifest, *get_recorded_prerequisites(manifest))]
     return {name: _words([own[name], *(one[name] for one in others if name in one)]) for name in own}
 
 
 def _with_prerequisites(origin: Origin, run: Run) -> Origin:
-    prerequisite = recorded_prerequisites(run.manifest)
+    prerequisite = get_recorded_prerequisites(run.manifest)
     digests: dict[str, list[str]] = defaultdict(list)
     for one in prerequisite:
         digests[one["id"]] += [one["weights"][:8]] if one.get("weights") else []
     weights = {name: _words(found) for name, found in digests.items() if found}
     joined = _joined(origin, list(map(_origin, prerequisite)))
     return replace(
-        joined, prerequisite_versions=prerequisite_versions(run.manifest), prerequisite_weights=weights
+        joined,
+        prerequisite_versions=collect_prerequisite_versions(run.manifest),
+        prerequisite_weights=weights,
     )
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.errors import InputError, one_line, why_unreadable
+from memmlp.common.errors import InputError, describe_read_error, escape_line_breaks
 from memmlp.report.tables.table import Cell, Effect, Row, Table
 
 FORMAT = "memmlp web bench 1"
@@ -59,7 +59,7 @@ def read(path: Path) -> BrowserBench:
             raise ValueError("it has no rows")
         return BrowserBench({name: _check(content, name, kind) for name, kind in ABOUT.items()}, rows)
     except OSError as error:
-        raise InputError(f"--add {path}: {why_unreadable(error)}") from None
+        raise InputError(f"--add {path}: {describe_read_error(error)}") from None
     except (ValueError, KeyError, TypeError) as error:
         expected = "expected a file that the bench of a site of memmlp web copies or saves"
         raise InputError(f"--add {path}: {error}; {expected}") from None
@@ -69,7 +69,7 @@ def _check(found: Mapping[str, Any], name: str, kind: type, optional: bool = Fal
     """Return a text that is safe to print on a terminal, or a number above 0."""
     value = found[name]
     if kind is str and isinstance(value, str) and 0 < len(value) <= 300:
-        return one_line(value)
+        return escape_line_breaks(value)
     if kind is float and type(value) in (int, float) and math.isfinite(value) and value > 0:
         return value
     if optional and value is None:

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 
 from rich.console import Console
 
-from memmlp.common.files import plain
+from memmlp.common.files import make_json_safe
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import STEADY, Cell, Row, Table
@@ -334,7 +334,7 @@ def to_json(table: Table) -> str:
             for metric, cell in cells.items():
                 summary = {"mean": cell.mean, "sd": cell.sd, "agrees": cell.agrees}
                 words["cells"][mode][metric] |= summary
-    return json.dumps(plain(fields), indent=2, ensure_ascii=False) + "\n"
+    return json.dumps(make_json_safe(fields), indent=2, ensure_ascii=False) + "\n"
 
 
 def show(table: Table, console: Console) -> None:

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import plain, read_json
-from memmlp.runs.deployment_folder import as_deployed
+from memmlp.common.files import make_json_safe, read_json
+from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import EvaluationsAsConfigured, name_solvers
-from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, flatten, training_settings
-from memmlp.runs.lookup import run_name
-from memmlp.runs.run import Run, latency_name
+from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, find_training_settings, flatten
+from memmlp.runs.lookup import get_run_name
+from memmlp.runs.run import Run, name_latency
 
 HIDDEN = ("paths", "loggers", "force", "hydra", "save_predictions")
 """Config groups that are not listed."""
@@ -80,7 +80,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
     notes = read_json(folder / "notes.json")
     return {
         "id": run.id,
-        "name": run_name(manifest, listed),
+        "name": get_run_name(manifest, listed),
         "kind": _text(manifest.get("kind")),
         "done": run.done,
         "started": _text(manifest.get("started")),
@@ -114,7 +114,7 @@ def select_listed(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return a config's listed values by dotted key."""
     return {
         key: value
-        for key, value in plain(flatten(config)).items()
+        for key, value in make_json_safe(flatten(config)).items()
         if key.split(".")[0] not in HIDDEN and not key.endswith(("._target_", "._partial_"))
     }
 
@@ -151,7 +151,7 @@ def parse_line(line: bytes) -> dict[str, Any] | None:
 
 def _total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
     try:
-        steps = training_settings(str(kind), config)["steps"]
+        steps = find_training_settings(str(kind), config)["steps"]
     except (KeyError, TypeError):
         return None
     return steps if isinstance(steps, int) else None
@@ -166,7 +166,7 @@ def _read_metrics(run: Run, config: Mapping[str, Any], damage: list[str]) -> dic
     except (InputError, KeyError, TypeError, AttributeError):
         damage.append("evaluations")
     deployed = run.find_shown_deployment(config)
-    name, record = latency_name(deployed, config), as_deployed(deployed.record)
+    name, record = name_latency(deployed, config), select_deployed_measurements(deployed.record)
     found |= {f"{name}.{key}": record[key] for key in COSTS if key in record}
     if run.results_path.exists():
         found |= flatten(read_json(run.results_path), "vqvae.")

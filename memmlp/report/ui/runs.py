@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import plain, read_json
+from memmlp.common.files import make_json_safe, read_json
 from memmlp.report.tables.measured_run import load
 from memmlp.report.tables.table_text import find_direction, find_unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, parse_line, read_config
-from memmlp.runs.deployment_folder import as_deployed
+from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import name_solvers
 from memmlp.runs.identity import NETWORK, NEUTRAL, flatten, is_data_path
-from memmlp.runs.lookup import frames_seen, hardly_trained, is_trained
+from memmlp.runs.lookup import count_training_frames, is_trained, warn_if_hardly_trained
 from memmlp.runs.run import Run
 
 VIEWABLE = (
@@ -131,7 +131,7 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
 
 
 def _read_flat_config(run: Run) -> dict[str, Any]:
-    return plain(flatten(read_config(run)))
+    return make_json_safe(flatten(read_config(run)))
 
 
 def read_clips(run: Run) -> list[dict[str, Any]]:
@@ -161,7 +161,7 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
 def _read_latency(run: Run) -> dict[str, Any]:
     """Return the measurements of the deployment that the run's config asks for."""
     try:
-        record = as_deployed(run.deployment_as_configured.record)
+        record = select_deployed_measurements(run.deployment_as_configured.record)
     except InputError:
         return {}
     return {key: value for key, value in flatten(record).items() if isinstance(value, int | float | str)}
@@ -177,7 +177,7 @@ def outdated_modes(run: Run) -> list[str]:
 
 def _warn_of_short_training(run: Run) -> str:
     try:
-        return hardly_trained(frames_seen(run))
+        return warn_if_hardly_trained(count_training_frames(run))
     except (ValueError, TypeError, AttributeError):
         return ""
 

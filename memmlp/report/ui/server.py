@@ -10,8 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import digest, plain
-from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, content_type, security_policy
+from memmlp.common.files import digest, make_json_safe
+from memmlp.common.page_server import (
+    HOST,
+    TEXT,
+    PageHandler,
+    PageServer,
+    build_security_policy,
+    find_content_type,
+)
 from memmlp.report.ui import page_files, runs
 from memmlp.report.ui.replay import Predict, Replays, describe_body
 from memmlp.report.ui.run_index import RunIndex
@@ -128,7 +135,7 @@ class RunsHandler(PageHandler):
         kind, _, name = path.partition("/")
         if path in ("", *page_files.FILES):
             file = path or "index.html"
-            self.send(200, content_type(file), page_files.read(file))
+            self.send(200, find_content_type(file), page_files.read(file))
         elif kind == "api":
             self._send_answer(name, query)
         elif kind == "files":
@@ -152,7 +159,7 @@ class RunsHandler(PageHandler):
         try:
             text = json.dumps(value, separators=(",", ":"), allow_nan=False)
         except ValueError:  # NaN or infinity
-            text = json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
+            text = json.dumps(make_json_safe(value), separators=(",", ":"), allow_nan=False)
         self.send(code, "application/json", text.encode())
 
     def _send_run_file(self, run_id: str, name: str) -> None:
@@ -174,7 +181,7 @@ class RunsServer(PageServer):
 
     def __init__(self, answers: Answers, port: int, host: str = HOST, token: str | None = None):
         self.answers = answers
-        policy = security_policy(page_files.read("index.html").decode())
+        policy = build_security_policy(page_files.read("index.html").decode())
         self.headers = {"Content-Security-Policy": f"{policy}; frame-ancestors 'none'"}
         super().__init__(RunsHandler, port, host, token)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import plain
+from memmlp.common.files import make_json_safe
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.build_table import find_finished_runs, make_table
 from memmlp.report.tables.measured_run import Measured, load
@@ -28,7 +28,7 @@ from memmlp.report.tables.seed_rounds import (
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table_text import find_direction, make_caption, make_heading, make_legend, to_json
 from memmlp.report.ui.run_index import RunIndex
-from memmlp.runs.identity import NETWORK, training_settings
+from memmlp.runs.identity import NETWORK, find_training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, load_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask
@@ -170,7 +170,7 @@ class Sweeps:
     def _steps(self, task: RunTask, state: str) -> tuple[int, int]:
         """Return the number of a task's training steps, and how many of them remain."""
         facts = self.index.runs.get(task.id) or {}
-        total = int(facts.get("steps") or training_settings(task.kind, task.config)["steps"] or 0)
+        total = int(facts.get("steps") or find_training_settings(task.kind, task.config)["steps"] or 0)
         last = facts["recent"][-1][0] if facts.get("recent") else 0
         return total, 0 if state == "done" else max(total - int(last), 0)
 
@@ -248,7 +248,7 @@ def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:
         rounds = Rounds.read(path)
         if rounds is None or not rounds.analyses:
             return None, []
-        if rounds.subject != plain(describe_subject(sweep)):
+        if rounds.subject != make_json_safe(describe_subject(sweep)):
             return None, [OTHER_ROUNDS]
         check_same_runs(rounds, sweep, plan, path)
     except InputError:

@@ -18,11 +18,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from memmlp.common.files import digest, file_digest, plain, read_json
-from memmlp.runs.deployment_folder import with_times_as_deployed
+from memmlp.common.files import digest, file_digest, make_json_safe, read_json
+from memmlp.runs.deployment_folder import replace_with_deployed_times
 from memmlp.runs.evaluation_file import name_solvers
 from memmlp.runs.identity import flatten
-from memmlp.runs.lookup import read_notes, run_name
+from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.metrics_log import parse_record
 from memmlp.runs.run import Run
 
@@ -91,7 +91,7 @@ class RunFacts:
         return {name: text for name, text in texts.items() if text}
 
 
-def read_run(run: Run, running: bool = False) -> RunFacts:
+def read_run_facts(run: Run, running: bool = False) -> RunFacts:
     """Read the facts of a run that has started.
 
     Args:
@@ -102,10 +102,12 @@ def read_run(run: Run, running: bool = False) -> RunFacts:
     failure, finished = read_json(run.folder / "FAILED"), manifest.get("finished")
     status = "running" if running else "failed" if failure else "done" if run.complete else "killed"
     records = run.metrics()
-    started = _seconds(manifest.get("started"))
-    ended = _seconds(failure.get("when") or finished) or max((one.time for one in records), default=started)
+    started = _parse_time(manifest.get("started"))
+    ended = _parse_time(failure.get("when") or finished) or max(
+        (one.time for one in records), default=started
+    )
     evaluations, deployed = run.evaluations_as_configured, run.find_shown_deployment(config)
-    results = flatten(name_solvers(with_times_as_deployed(run.results), evaluations.combined_solvers))
+    results = flatten(name_solvers(replace_with_deployed_times(run.results), evaluations.combined_solvers))
     step = max((record.step for record in records), default=0)
     git = manifest.get("git") or {}
     origin = {name: manifest.get(name) for name in ORIGIN}
@@ -116,7 +118,7 @@ def read_run(run: Run, running: bool = False) -> RunFacts:
     )  # fmt: skip
     facts = RunFacts(
         id=run.id,
-        name=run_name(manifest, flatten(config)),
+        name=get_run_name(manifest, flatten(config)),
         folder=run.folder.absolute(),
         status=status,
         reason=failure.get("reason") if not running else None,
@@ -136,10 +138,10 @@ def read_run(run: Run, running: bool = False) -> RunFacts:
         files=tuple(path for path in files if path.is_file()),
     )
     digests = [file_digest(path) for path in (run.metrics_path, *facts.files) if path.exists()]
-    return replace(facts, fingerprint=digest([plain(asdict(facts)), digests]))
+    return replace(facts, fingerprint=digest([make_json_safe(asdict(facts)), digests]))
 
 
-class Tail:
+class LogReader:
     """Reads a run's metrics log: first all existing lines, then only new lines.
 
     Attributes:
@@ -174,7 +176,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _seconds(moment: str | None) -> float:
+def _parse_time(moment: str | None) -> float:
     return datetime.fromisoformat(moment).timestamp() if moment else 0.0
 
 
@@ -228,7 +230,7 @@ class Session:
         with self._close_on_failure():
             if self.shown is None:
                 if self.run.manifest_path.exists():
-                    self._begin(read_run(self.run, running=True))
+                    self._begin(read_run_facts(self.run, running=True))
             elif points := self.tail.read():
                 self.shown.log(points)
 
@@ -237,7 +239,7 @@ class Session:
         if not self.run.manifest_path.exists():
             return  # the run never started
         with self._close_on_failure():
-            facts = read_run(self.run)
+            facts = read_run_facts(self.run)
             shown = self.shown or self._begin(facts)
             if points := self.tail.read():
                 shown.log(points)
@@ -254,7 +256,7 @@ class Session:
 
     def _begin(self, facts: RunFacts) -> ShownRun:
         self.close()
-        self.tail = Tail(self.run)
+        self.tail = LogReader(self.run)
         self.shown = self.logger.begin(facts, self.tail.read())
         return self.shown
 
@@ -289,23 +291,25 @@ class Loggers:
         waits at its end for at most MAX_WAIT.
         """
         ended = threading.Event()
-        threads = self._start_threads(lambda logger: _follow(Session(logger, run), ended), f"run {run.id}")
+        threads = self._start_threads(
+            lambda logger: _show_until_end(Session(logger, run), ended), f"run {run.id}"
+        )
         try:
             yield
         finally:
             ended.set()
-            _join(threads)
+            _wait_for_threads(threads)
 
     def _start_threads(self, work: Callable[[RunLogger], object], subject: str) -> list[threading.Thread]:
         threads = []
         for one in self.loggers:
-            warning = f"{subject} is not shown in {one.name}"  # `_join` prints it
+            warning = f"{subject} is not shown in {one.name}"  # `_wait_for_threads` prints it
             threads.append(threading.Thread(target=work, args=(one,), name=warning, daemon=True))
             threads[-1].start()
         return threads
 
 
-def _join(threads: Sequence[threading.Thread]) -> None:
+def _wait_for_threads(threads: Sequence[threading.Thread]) -> None:
     """Wait for threads for at most MAX_WAIT, and print a warning about each unfinished thread."""
     end = time.monotonic() + MAX_WAIT
     for thread in threads:
@@ -314,7 +318,7 @@ def _join(threads: Sequence[threading.Thread]) -> None:
             _warn(f"{thread.name}: the logger is too slow")
 
 
-def _follow(session: Session, ended: threading.Event) -> None:
+def _show_until_end(session: Session, ended: threading.Event) -> None:
     """Show a run until its end. After a failure, warn once and try again with growing pauses."""
     pause, failed = PACE, False
 
@@ -325,7 +329,7 @@ def _follow(session: Session, ended: threading.Event) -> None:
             return True
         except Exception as error:
             if not failed:
-                _warn(f"run {session.run.id} is not shown in {session.logger.name}: {_reason(error)}")
+                _warn(f"run {session.run.id} is not shown in {session.logger.name}: {_format_error(error)}")
             failed = True
             return False
 
@@ -340,11 +344,11 @@ def _warn(line: str) -> None:
         print(f"memmlp: warning: {line}; run memmlp loggers sync to add it", file=sys.stderr, flush=True)
 
 
-def _reason(error: BaseException) -> str:
+def _format_error(error: BaseException) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def sync(
+def sync_runs(
     logger: RunLogger, runs: Iterable[Run], report: Callable[[str], None], full: bool = False
 ) -> Counter[str]:
     """Update a logger with the content of each run's folder; runs in progress are skipped.
@@ -363,12 +367,12 @@ def sync(
         try:
             if run.activity:
                 counts["live"] += 1
-            elif not full and logger.fingerprint(run.id) == read_run(run).fingerprint:
+            elif not full and logger.fingerprint(run.id) == read_run_facts(run).fingerprint:
                 counts["same"] += 1
             else:
                 Session(logger, run).end()
                 counts["shown"] += 1
         except Exception as error:
             counts["failed"] += 1
-            report(f"run {run.id} is not shown in {logger.name}: {_reason(error)}")
+            report(f"run {run.id} is not shown in {logger.name}: {_format_error(error)}")
     return counts

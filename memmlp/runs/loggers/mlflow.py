@@ -82,10 +82,10 @@ class MLflow:
         from mlflow.entities import Dataset, DatasetInput, Param
 
         with self.client() as (client, experiment):
-            tags = {"memmlp.run_id": facts.id} | _tags(facts)
+            tags = {"memmlp.run_id": facts.id} | _build_tags(facts)
             run_id = _replace_run(client, experiment, "memmlp.run_id", facts.name, tags, facts.started)
             params = [Param(key, value[:PARAM_LENGTH]) for key, value in facts.config.items()]
-            for batch in _batches(params, PARAMS):
+            for batch in _split_into_batches(params, PARAMS):
                 client.log_batch(run_id, params=batch)
             name, digest = facts.data  # MLflow allows 36 characters of a digest; a tag has all of it
             client.log_inputs(run_id, [DatasetInput(Dataset(name, digest[:36], "local", "{}"), [])])
@@ -132,18 +132,18 @@ class ShownInMLflow:
     def log(self, points: Sequence[CurvePoint]) -> None:
         """Send points in batches."""
         with self.logger.client() as (client, _):
-            _log(client, self.mlflow_id, points)
+            _send_points(client, self.mlflow_id, points)
 
     def end(self, facts: RunFacts) -> None:
         """Send results, tags and files, and set the final status of the MLflow run."""
         from mlflow.entities import RunTag
 
         with self.logger.client() as (client, _):
-            _log(client, self.mlflow_id, facts.results)
+            _send_points(client, self.mlflow_id, facts.results)
             for path in facts.files:
                 client.log_artifact(self.mlflow_id, str(path))
-            tags = _tags(facts) | {"memmlp.fingerprint": facts.fingerprint}
-            for batch in _batches([RunTag(*pair) for pair in tags.items()], PARAMS):
+            tags = _build_tags(facts) | {"memmlp.fingerprint": facts.fingerprint}
+            for batch in _split_into_batches([RunTag(*pair) for pair in tags.items()], PARAMS):
                 client.log_batch(self.mlflow_id, tags=batch)
             client.set_terminated(self.mlflow_id, STATUS[facts.status], int((facts.ended or 0) * 1000))
 
@@ -162,19 +162,19 @@ def _replace_run(
     return client.create_run(experiment, start_ms, dict(tags), run_name=name).info.run_id
 
 
-def _log(client: MlflowClient, mlflow_id: str, points: Sequence[CurvePoint]) -> None:
+def _send_points(client: MlflowClient, mlflow_id: str, points: Sequence[CurvePoint]) -> None:
     from mlflow.entities import Metric
 
-    for batch in _batches(points, METRICS):
+    for batch in _split_into_batches(points, METRICS):
         metrics = [Metric(point.key, point.value, int(point.time * 1000), point.step) for point in batch]
         client.log_batch(mlflow_id, metrics=metrics)
 
 
-def _batches(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
+def _split_into_batches(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
     return (list(items[start : start + size]) for start in range(0, len(items), size))
 
 
-def _tags(facts: RunFacts) -> dict[str, str]:
+def _build_tags(facts: RunFacts) -> dict[str, str]:
     tags = {f"memmlp.{key.replace(' ', '_')}": value for key, value in facts.origin.items()}
     tags |= {f"memmlp.label.{label}": "yes" for label in facts.tags}
     given = {

@@ -56,7 +56,7 @@ class TensorBoard:
         """Start a new event file for a run, and remove older ones."""
         for old in self._folders(facts.id):
             shutil.rmtree(old)
-        shown = ShownInTensorBoard(Path(self.place) / _folder_name(facts.name, facts.id))
+        shown = ShownInTensorBoard(Path(self.place) / _make_folder_name(facts.name, facts.id))
         shown.log(points)
         return shown
 
@@ -86,7 +86,7 @@ class ShownInTensorBoard:
 
     def end(self, facts: RunFacts) -> None:
         """Write the results; write status, tags, note and config as text."""
-        config = _markdown("key", "value", facts.config)
+        config = _format_table("key", "value", facts.config)
         self.write_texts({**facts.texts, "tags": ", ".join(facts.tags), "note": facts.note, "config": config})
         self.log(facts.results)
         (self.folder / FINGERPRINT).write_text(facts.fingerprint)
@@ -96,11 +96,11 @@ class ShownInTensorBoard:
         self.writer.close()
 
 
-def _markdown(key: str, value: str, rows: Mapping[str, Any]) -> str:
+def _format_table(key: str, value: str, rows: Mapping[str, Any]) -> str:
     return "\n".join([f"| {key} | {value} |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())])
 
 
-def _folder_name(name: str, run_id: str = "") -> str:
+def _make_folder_name(name: str, run_id: str = "") -> str:
     """Return the folder name that TensorBoard shows for a run: its name and the first digits of its id."""
     ending = f" · {run_id[:8]}" if run_id else ""
     return re.sub(r"[^\w=.,·+() -]", "_", name)[: MAX_NAME - len(ending)] + ending

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.errors import InputError, require
+from memmlp.common.errors import InputError, import_optional
 from memmlp.sweep.executors import Work, parse_amount
 from memmlp.sweep.executors.local import LINE, VISIBLE, start_process
 
@@ -62,7 +62,7 @@ class Dask:
     """
 
     def __init__(self, options: Mapping[str, Any], gpus: bool = True):
-        self.distributed: Any = require("distributed", "dask", "executor=dask")
+        self.distributed: Any = import_optional("distributed", "dask", "executor=dask")
         address = options.get("address") or os.environ.get("DASK_SCHEDULER_ADDRESS")
         if not address:
             raise InputError("executor=dask: dask.address=HOST:PORT of a scheduler is missing")

@@ -13,7 +13,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.common.processes import collect_garbage_rarely, import_environment, termination_interrupts
+from memmlp.common.processes import (
+    build_import_variables,
+    collect_garbage_rarely,
+    treat_termination_as_interrupt,
+)
 from memmlp.sweep.executors import Work
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -141,7 +145,7 @@ def start_process(
     with open(folder / "log.txt", "ab") as log:
         return subprocess.Popen(
             command,
-            env={**os.environ, **import_environment(), **environment},
+            env={**os.environ, **build_import_variables(), **environment},
             stdin=subprocess.PIPE if with_parent else subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -154,7 +158,7 @@ def do_work(folder: Path) -> None:
     collect_garbage_rarely()
     work: Work = pickle.loads((folder / WORK).read_bytes())
     (folder / WORK).unlink()
-    with termination_interrupts():
+    with treat_termination_as_interrupt():
         line = work()
     if line is not None:
         (folder / LINE).write_text(line, encoding="utf-8")

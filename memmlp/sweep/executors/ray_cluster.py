@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from memmlp.common.errors import InputError, require, why_unreadable
+from memmlp.common.errors import InputError, describe_read_error, import_optional
 from memmlp.sweep.executors import Work, parse_amount
 from memmlp.sweep.executors.local import VISIBLE
 
@@ -19,7 +19,7 @@ def _read_runtime_env(path: str) -> Mapping[str, Any]:
     try:
         found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(why_unreadable(error)) from None
+        raise ValueError(describe_read_error(error)) from None
     if not isinstance(found, dict):
         raise ValueError("expected a YAML file of Ray's keys, such as env_vars")
     return found
@@ -73,7 +73,7 @@ class Ray:
     """
 
     def __init__(self, options: Mapping[str, Any], gpus: bool = True):
-        self.ray: Any = require("ray", "ray", "executor=ray")
+        self.ray: Any = import_optional("ray", "ray", "executor=ray")
         if not self.ray.is_initialized():
             self._connect(options)
         there = self.ray.cluster_resources()

@@ -15,7 +15,7 @@ import submitit
 import submitit.helpers
 
 from memmlp.common.errors import InputError
-from memmlp.common.processes import children_import_the_same, collect_garbage_rarely
+from memmlp.common.processes import collect_garbage_rarely, pass_import_paths_to_children
 from memmlp.sweep.executors import Work
 
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
@@ -174,7 +174,7 @@ class Slurm:
         with _one_line_errors():
             self.executor = SubmititSlurm(folder=folder, python=options.python)
             self.executor.set(options)
-        self.imports = children_import_the_same if options.python is None else contextlib.nullcontext
+        self.imports = pass_import_paths_to_children if options.python is None else contextlib.nullcontext
         self.gpus = options.gpu
 
     def submit(self, work: Work, count: int = 1) -> list[Job]:

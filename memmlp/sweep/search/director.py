@@ -16,7 +16,7 @@ from optuna.trial import Trial, TrialState
 
 from memmlp.common.errors import InputError
 from memmlp.common.lease import check_owner
-from memmlp.runs.identity import inference
+from memmlp.runs.identity import select_inference_config
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
 from memmlp.sweep.controller import LOOK, Fleet
@@ -122,7 +122,10 @@ class Director:
         last = [tasks[-1] for tasks in one.seeds]
         runs = [self.plan.run_of(task) for task in last]
         for task, run in zip(last, runs, strict=True):
-            used, wanted = inference(run.config) if run.done else None, inference(task.config)
+            used, wanted = (
+                select_inference_config(run.config) if run.done else None,
+                select_inference_config(task.config),
+            )
             if used is not None and used != wanted:
                 self.study.fail(one.trial, f"run {run.id} was validated with {used}, not {wanted}")
                 return True
@@ -145,7 +148,8 @@ class Director:
         """
         outputs = self.plan.outputs
         return sum(
-            max(1, sum(not Run.from_id(outputs, name).done for name in one.runs)) for one in self.running.values()
+            max(1, sum(not Run.from_id(outputs, name).done for name in one.runs))
+            for one in self.running.values()
         )
 
     def _report(self, trial: Trial, run: Run) -> int:

@@ -18,9 +18,9 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.importance import PedAnovaImportanceEvaluator
 from optuna.trial import FrozenTrial, TrialState
 
-from memmlp.common.errors import require
+from memmlp.common.errors import import_optional
 from memmlp.common.files import atomic_write
-from memmlp.common.overrides import last_by_key
+from memmlp.common.overrides import select_last_by_key
 from memmlp.sweep.search.study import Study, deviations, reason, trial_values
 
 IMPORTANCE = "by which keys the best tenth of the trials differs"
@@ -93,7 +93,7 @@ def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str
     tree: dict[str, Any] = {}
     options: list[dict[str, str]] = []
     texts = (*search.base, *search.overrides(trial_values(trial, search)))
-    for key, override in last_by_key(texts).items():
+    for key, override in select_last_by_key(texts).items():
         if key == "experiment":
             continue
         if key in groups:
@@ -207,7 +207,7 @@ def plots(study: Study) -> dict[str, dict[str, Any]]:
 
 def write_plots(study: Study, path: Path) -> None:
     """Write the plots into one HTML page, which works offline; nothing for fewer than two trials."""
-    require("plotly", "plots", "the page of a search")
+    import_optional("plotly", "plots", "the page of a search")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         figures = [

@@ -29,7 +29,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.overrides import value_text
+from memmlp.common.overrides import format_value
 from memmlp.common.settings import Rule, matching, one_of
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 
@@ -123,7 +123,7 @@ class Search:
 
     def overrides(self, values: Mapping[str, Value]) -> tuple[str, ...]:
         """Return a trial's values as overrides of `memmlp train`."""
-        return tuple(f"{key}={value_text(value)}" for key, value in values.items())
+        return tuple(f"{key}={format_value(value)}" for key, value in values.items())
 
 
 def _whole(least: int) -> Rule:
@@ -215,7 +215,7 @@ def _ranges(node: Any, prefix: str) -> Iterator[Range]:
 def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
     choices = node["choices"]
     if isinstance(choices, list):
-        choices = [value_text(one) if isinstance(one, list) else one for one in choices]
+        choices = [format_value(one) if isinstance(one, list) else one for one in choices]
     plain = isinstance(choices, Sequence) and all(isinstance(one, int | float | str) for one in choices)
     if isinstance(choices, str) or not plain or len(set(choices)) < max(len(choices), 2):
         raise InputError(f"{where}.choices: expected a list of at least two values, each once")

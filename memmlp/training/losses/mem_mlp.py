@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from memmlp.common.components import chosen, component
+from memmlp.common.components import component, find_chosen_settings
 from memmlp.common.errors import InputError
 from memmlp.common.settings import Settings
 from memmlp.motion.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, ROTATION, SPARSE_DIM
@@ -47,7 +47,7 @@ class HandPositionSettings(Settings):
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
         """Yield whether the predictor has no positions; see Settings."""
-        if not getattr(chosen(config, "predictor"), "positions", True):
+        if not getattr(find_chosen_settings(config, "predictor"), "positions", True):
             yield f"hand=position: must be fk or off with predictor={config['predictor']['name']}"
 
 

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.common.components import chosen, component
+from memmlp.common.components import component, find_chosen_settings
 from memmlp.common.errors import InputError
 from memmlp.common.settings import at_least, one_of, positive, setting
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_POSITION
@@ -240,7 +240,7 @@ class TermsLossSettings(CompleteLossSettings):
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
         """Yield which terms need more frames than the network learns of a window; see Settings."""
-        newest = getattr(chosen(config, "model"), "learns_newest_frame", False)
+        newest = getattr(find_chosen_settings(config, "model"), "learns_newest_frame", False)
         frames = 1 if newest else config["model"]["frames"]
         for name, needed in TERM_FRAMES.items():
             if config["loss"].get(name) is not None and frames < needed:

@@ -15,7 +15,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import announce_to
+from memmlp.common.progress import send_announcements_to
 from memmlp.live.outputs import encode_osc
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.session.sources import (
@@ -242,7 +242,7 @@ def test_an_unusual_file_is_reported_and_a_short_one_rejected(tmp_path: Path):
     write_clip(tmp_path / "a.npz", Clip("a", turns, np.zeros((5, 3)), 60.0))
     write_clip(tmp_path / "b.npz", Clip("b", turns[:2], np.zeros((2, 3)), 60.0))
     said: list[str] = []
-    with announce_to(said.append):
+    with send_announcements_to(said.append):
         assert len(npz_frames(tmp_path / "a.npz", builtin_rest_joints())) == 4
         with pytest.raises(InputError, match=r"b\.npz: 2 frames"):
             npz_frames(tmp_path / "b.npz", builtin_rest_joints())

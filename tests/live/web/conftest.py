@@ -16,7 +16,7 @@ from conftest import shared
 from filelock import FileLock
 
 from memmlp.common.errors import InputError
-from memmlp.common.npm import ONNXRUNTIME_WEB, Package, read
+from memmlp.common.npm import ONNXRUNTIME_WEB, Package, read_package_files
 from memmlp.deploy.export import export
 from memmlp.live.trackers_to_body_graph import export_full
 from memmlp.live.web.site import Site, SiteNetwork, pack_clip
@@ -55,7 +55,7 @@ def once(write: Callable[..., None]) -> Callable[..., None]:
 def package_files(package: Package, *names: str) -> list[bytes]:
     """Files of an npm package; skips where they cannot be had."""
     try:
-        found = read(package, names)
+        found = read_package_files(package, names)
     except InputError as error:
         pytest.skip(str(error))
     return [found[name] for name in names]

@@ -9,7 +9,7 @@ import pytest
 from bvh_samples import person
 from mutations import mutated, sound_npz
 
-from memmlp.common.errors import InputError, one_line
+from memmlp.common.errors import InputError, escape_line_breaks
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
 
@@ -50,7 +50,7 @@ def test_damage_is_one_line_or_finite(name, tmp_path):
             if message:
                 refused += 1
                 assert str(path) in message
-                assert one_line(message) == message
+                assert escape_line_breaks(message) == message
         assert tracemalloc.get_traced_memory()[1] < MOST
     finally:
         tracemalloc.stop()

@@ -284,7 +284,7 @@ def test_prerequisite_runs_of_different_origin(
     flags: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch
 ):
     """A VQ-VAE by other code, on another machine, or trained again under its id, affects every error."""
-    monkeypatch.setattr("memmlp.report.tables.flags.code_digests", lambda packages: {"ik.py": "1"})
+    monkeypatch.setattr("memmlp.report.tables.flags.compute_code_digests", lambda packages: {"ik.py": "1"})
 
     def flags_upon(change: dict[str, Any]) -> list[str]:
         def settings(label: str, _: int) -> dict[str, Any]:
@@ -326,7 +326,7 @@ def test_seeds_upon_other_weights_of_one_prerequisite(sweep: Sweep, tmp_path: Pa
 def test_runs_from_before_code_changed(flags: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch):
     """Files of memmlp and of users' packages."""
     now = {"training/loop.py": "1", "ik.py": "1", "new.py": "1", "mine:mine.py": "2"}
-    monkeypatch.setattr("memmlp.report.tables.flags.code_digests", lambda packages: now)
+    monkeypatch.setattr("memmlp.report.tables.flags.compute_code_digests", lambda packages: now)
     code = {"training/loop.py": "1", "ik.py": "1", "gone.py": "0"}
     old = {"full_model": code | {"ik.py": "0"}, "by position": code | {"mine:mine.py": "1"}}
 

@@ -16,7 +16,7 @@ from memmlp.common.files import read_json
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.tables.measured_run import Measured, load
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import VERSIONS, deployment_id_of, outdated
+from memmlp.runs.identity import VERSIONS, hash_deployment_settings, list_outdated
 from memmlp.sweep.definition import Sweep
 
 
@@ -44,13 +44,13 @@ def test_costs_of_an_earlier_recipe_are_known_as_such(tmp_path: Path, monkeypatc
     before = load(run.folder).origin.component_versions
     path = run.deployment("fp32-0").latency
     path.write_text(json.dumps(json.loads(path.read_text()) | {"settings": settings}))
-    path.parent.rename(path.parent.with_name(deployment_id_of(settings)))
+    path.parent.rename(path.parent.with_name(hash_deployment_settings(settings)))
     after = load(run.folder).origin.component_versions
     made_by = {name: number for name, number in after.items() if name not in before}
     assert made_by.keys() == {"export", "latency", "graph.naive", "int8"}
     number = made_by["latency"]
     monkeypatch.setitem(VERSIONS, "latency", number + 1)
-    assert outdated(made_by) == [f"latency {number} -> {number + 1}"]
+    assert list_outdated(made_by) == [f"latency {number} -> {number + 1}"]
     assert load(run.folder).origin.component_versions == before  # by which numbers it was made, is not known
 
 

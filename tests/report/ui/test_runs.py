@@ -12,7 +12,12 @@ from report.ui.conftest import started_run
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.ui.runs import describe_units, differing_keys, outdated_modes, read_curves, thin_out
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import VERSIONS, evaluation_id_of, evaluation_settings, evaluation_versions
+from memmlp.runs.identity import (
+    VERSIONS,
+    find_evaluation_versions,
+    hash_evaluation_settings,
+    select_evaluation_settings,
+)
 from memmlp.runs.run import Run
 
 
@@ -44,9 +49,13 @@ def test_units_and_what_is_better_of_known_metrics():
 
 
 def test_modes_of_an_earlier_component_version_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run, settings = Run(tmp_path / ("a" * 16)), evaluation_settings({}, "window")
-    report = {"mode": "window", "settings": settings, "component_versions": evaluation_versions(settings)}
-    write_report(run.evaluation(evaluation_id_of(settings)), {**report, "mean": {}, "clips": []})
+    run, settings = Run(tmp_path / ("a" * 16)), select_evaluation_settings({}, "window")
+    report = {
+        "mode": "window",
+        "settings": settings,
+        "component_versions": find_evaluation_versions(settings),
+    }
+    write_report(run.evaluation(hash_evaluation_settings(settings)), {**report, "mean": {}, "clips": []})
     assert outdated_modes(run) == []
     now = VERSIONS["mode.window"]
     monkeypatch.setitem(VERSIONS, "mode.window", now + 1)

@@ -13,7 +13,7 @@ from processes import until
 from memmlp.common.files import write_json
 from memmlp.runs.identity import VERSIONS
 from memmlp.runs.loggers import logger as module
-from memmlp.runs.loggers.logger import Loggers, Session, Tail, read_run, sync
+from memmlp.runs.loggers.logger import Loggers, LogReader, Session, read_run_facts, sync_runs
 from memmlp.runs.lookup import add_tags, set_note
 from memmlp.runs.run import Run
 
@@ -69,7 +69,7 @@ def test_a_server_that_comes_back_has_everything_once(tmp_path: Path, capsys: py
     assert (server.status[run.id], server.values[run.id]) == ("done", losses(4))
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1
-    assert f"run {run.id} is not shown in fake0: connection reset; memmlp loggers sync" in said[0]
+    assert f"run {run.id} is not shown in fake0: connection reset; run memmlp loggers sync" in said[0]
 
 
 def test_a_logger_that_stays_down_costs_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -88,7 +88,7 @@ def test_a_logger_that_hangs_holds_up_neither_the_run_nor_another(tmp_path: Path
     with loggers_of(tmp_path, hung, other).show_run(run):
         run.finish([])
     until(lambda: other.status.get(run.id) == "done", "the other's end")
-    assert capsys.readouterr().err.count("not shown in fake0: it is too slow") == 1
+    assert capsys.readouterr().err.count("not shown in fake0: the logger is too slow") == 1
     hung.gate.set()
     until(lambda: len(hung.fingerprints) == 1, "the end, late")
 
@@ -116,14 +116,14 @@ def test_a_sync_shows_what_changed_once(tmp_path: Path):
     runs = [a_run(tmp_path, "0" * 16), a_run(tmp_path, "1" * 16)]
     runs[0].finish([])
     runs[1].fail("why")
-    assert sync(logger, runs, said.append) == {"shown": 2}
-    assert sync(logger, runs, said.append) == {"same": 2}
+    assert sync_runs(logger, runs, said.append) == {"shown": 2}
+    assert sync_runs(logger, runs, said.append) == {"same": 2}
     assert logger.server.status == {runs[0].id: "done", runs[1].id: "failed"}
     add_tags(runs[0], ["good"])
-    assert sync(logger, runs, said.append) == {"shown": 1, "same": 1}
-    assert sync(logger, runs, said.append, full=True) == {"shown": 2}
+    assert sync_runs(logger, runs, said.append) == {"shown": 1, "same": 1}
+    assert sync_runs(logger, runs, said.append, full=True) == {"shown": 2}
     logger.server.fingerprints.clear()
-    assert sync(logger, runs, said.append) == {"shown": 2}
+    assert sync_runs(logger, runs, said.append) == {"shown": 2}
     assert logger.server.values == {run.id: losses(3) for run in runs}
     assert said == []
 
@@ -133,34 +133,34 @@ def test_a_sync_leaves_runs_in_progress_and_tells_what_fails(tmp_path: Path):
     live, bad, good = (a_run(tmp_path, name * 16) for name in "012")
     bad.config_path.write_text("{")
     with live.lock():
-        assert sync(logger, [live, bad, good], said.append) == {"live": 1, "failed": 1, "shown": 1}
+        assert sync_runs(logger, [live, bad, good], said.append) == {"live": 1, "failed": 1, "shown": 1}
     assert "config.yaml" in said[0]
 
 
 def test_status_is_that_of_the_folder(tmp_path: Path):
     run = a_run(tmp_path)
-    assert read_run(run, running=True).status == "running"
-    assert (read_run(run).status, read_run(run).ended) == ("killed", run.metrics()[-1].time)
+    assert read_run_facts(run, running=True).status == "running"
+    assert (read_run_facts(run).status, read_run_facts(run).ended) == ("killed", run.metrics()[-1].time)
     run.fail("a reason")
-    assert (read_run(run).status, read_run(run).reason) == ("failed", "a reason")
-    assert read_run(run, running=True).reason is None
+    assert (read_run_facts(run).status, read_run_facts(run).reason) == ("failed", "a reason")
+    assert read_run_facts(run, running=True).reason is None
     run.retry()
     run.finish([])
-    assert read_run(run).status == "done"
-    assert read_run(run, running=True).ended is None
+    assert read_run_facts(run).status == "done"
+    assert read_run_facts(run, running=True).ended is None
 
 
 def test_a_trained_run_without_what_was_asked_for_is_not_done(tmp_path: Path):
     run = a_run(tmp_path)
-    run.want(["stream-0", "fp32-0"])
+    run.request_stages(["stream-0", "fp32-0"])
     run.finish([])
-    assert read_run(run).status == "killed"
+    assert read_run_facts(run).status == "killed"
     run.evaluations.mkdir()
     write_json(run.evaluation("stream-0"), {"mode": "stream", "mean": {}, "clips": []})
-    assert read_run(run).status == "killed"
+    assert read_run_facts(run).status == "killed"
     run.deployment("fp32-0").folder.mkdir(parents=True)
     run.deployment("fp32-0").finish({})
-    assert read_run(run).status == "done"
+    assert read_run_facts(run).status == "done"
 
 
 def test_name_origin_data_labels_and_note(tmp_path: Path):
@@ -168,7 +168,7 @@ def test_name_origin_data_labels_and_note(tmp_path: Path):
     run.write_manifest({"name": "memory=gru · seed 1", "user": "somebody", "git": {"commit": "abc"}})
     add_tags(run, ["good"])
     set_note(run, "a note")
-    facts = read_run(run)
+    facts = read_run_facts(run)
     assert facts.name == "memory=gru · seed 1"
     assert facts.data == ("mocap", "d" * 64)
     assert (facts.tags, facts.note) == (("good",), "a note")
@@ -180,17 +180,17 @@ def test_results_by_an_earlier_recipe_are_told(tmp_path: Path, monkeypatch: pyte
     run = a_run(tmp_path, evaluation={"ik": "off"})
     an_outdated_evaluation(run)
     monkeypatch.setitem(VERSIONS, "mode.stream", 0)
-    now = read_run(run).fingerprint
-    assert read_run(run).outdated == ""
+    now = read_run_facts(run).fingerprint
+    assert read_run_facts(run).outdated == ""
     monkeypatch.setitem(VERSIONS, "mode.stream", 1)
-    assert read_run(run).outdated == "stream (mode.stream 0 -> 1)"
-    assert read_run(run).fingerprint != now
+    assert read_run_facts(run).outdated == "stream (mode.stream 0 -> 1)"
+    assert read_run_facts(run).fingerprint != now
 
 
 def test_a_tail_reads_the_last_of_repeated_steps_and_then_what_follows(tmp_path: Path):
     run = a_run(tmp_path)
     run.log(3, {"loss": 9.0})
-    tail = Tail(run)
+    tail = LogReader(run)
     assert [(p.step, p.value) for p in tail.read()] == [(1, 1.0), (2, 0.5), (3, 9.0)]
     assert tail.read() == []
     run.log(4, {"loss": 4.0})
@@ -203,7 +203,7 @@ def test_a_tail_reads_the_last_of_repeated_steps_and_then_what_follows(tmp_path:
 
 def test_a_line_is_read_when_it_is_whole(tmp_path: Path):
     run = a_run(tmp_path)
-    tail = Tail(run)
+    tail = LogReader(run)
     tail.read()
     whole = run.metrics_path.read_bytes().splitlines(keepends=True)[0]
     with open(run.metrics_path, "ab", buffering=0) as file:
@@ -215,7 +215,7 @@ def test_a_line_is_read_when_it_is_whole(tmp_path: Path):
 
 def test_the_fingerprint_changes_with_all_that_is_shown(tmp_path: Path):
     run = a_run(tmp_path)
-    seen = [read_run(run).fingerprint]
+    seen = [read_run_facts(run).fingerprint]
     for change in (
         lambda: run.log(4, {"loss": 1.0}),
         lambda: add_tags(run, ["a"]),
@@ -223,6 +223,6 @@ def test_the_fingerprint_changes_with_all_that_is_shown(tmp_path: Path):
         lambda: run.fail("why"),
     ):
         change()
-        seen.append(read_run(run).fingerprint)
+        seen.append(read_run_facts(run).fingerprint)
     assert len(set(seen)) == len(seen)
-    assert read_run(run).fingerprint == seen[-1]
+    assert read_run_facts(run).fingerprint == seen[-1]

@@ -11,7 +11,7 @@ from fake_logger import a_run as begun
 from fake_logger import an_outdated_evaluation
 
 from memmlp.common.files import write_json
-from memmlp.runs.loggers.logger import Session, sync
+from memmlp.runs.loggers.logger import Session, sync_runs
 from memmlp.runs.loggers.mlflow import MLflow
 from memmlp.runs.lookup import add_tags, remove_tags, set_note
 from memmlp.runs.run import Run
@@ -90,7 +90,7 @@ def test_a_run_from_its_start_to_its_end(tmp_path: Path, capfd: pytest.CaptureFi
     names = {"config.yaml", "results.json", "step.onnx", "latency.json"}
     assert files(tmp_path, run.id) - {"code.patch"} == names
     assert (tmp_path / "mlflow-artifacts").is_dir()
-    assert sync(logger, [run], print) == {"same": 1}
+    assert sync_runs(logger, [run], print) == {"same": 1}
     assert capfd.readouterr() == ("", "")
 
 
@@ -100,7 +100,7 @@ def test_what_changed_replaces_the_run(tmp_path: Path):
     add_tags(run, ["good"])
     set_note(run, "a note")
     outdated = an_outdated_evaluation(run)
-    sync(logger, [run], print)
+    sync_runs(logger, [run], print)
     tags = shown(tmp_path)[run.id].data.tags
     assert (tags["memmlp.label.good"], tags["mlflow.note.content"]) == ("yes", "a note")
     assert tags["memmlp.outdated_results"].startswith("stream (mode.stream 0 -> ")
@@ -110,7 +110,7 @@ def test_what_changed_replaces_the_run(tmp_path: Path):
     run.log(5, {"loss": 77.0})
     run.fail("loss is nan at step 5")
     other = a_run(tmp_path, "1" * 16)
-    assert sync(logger, [run, other], print) == {"shown": 2}
+    assert sync_runs(logger, [run, other], print) == {"shown": 2}
     found = shown(tmp_path)
     assert [found[one.id].info.status for one in (run, other)] == ["FAILED", "KILLED"]
     tags = found[run.id].data.tags
@@ -134,14 +134,14 @@ def test_many_values_go_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     run.begin("memmlp", {f"key{i}": i for i in range(250)}, data="d", prerequisite=None)
     for step in range(600):
         run.log(step, {"a": 1.0, "b": 2.0})
-    sync(MLflow(None, tmp_path), [run], print)
+    sync_runs(MLflow(None, tmp_path), [run], print)
     assert [size for size in sizes if size != (0, 0)] == [(0, 100), (0, 100), (0, 50), (1000, 0), (200, 0)]
     assert len(history(tmp_path, run, "train/b")) == 600
 
 
 def test_a_server_that_is_not_there_is_told(tmp_path: Path):
     said: list[str] = []
-    assert sync(MLflow("http://127.0.0.1:9", tmp_path), [begun(tmp_path)], said.append) == {"failed": 1}
+    assert sync_runs(MLflow("http://127.0.0.1:9", tmp_path), [begun(tmp_path)], said.append) == {"failed": 1}
     assert said[0].startswith(f"run {'0' * 16} is not shown in mlflow: ")
 
 

@@ -9,7 +9,7 @@ import pytest
 from fake_logger import a_run, an_outdated_evaluation
 from processes import until
 
-from memmlp.runs.loggers.logger import Session, sync
+from memmlp.runs.loggers.logger import Session, sync_runs
 from memmlp.runs.loggers.tensorboard import TensorBoard
 from memmlp.runs.lookup import set_note
 
@@ -47,9 +47,9 @@ def test_a_curve_grows_and_is_written_once(tmp_path: Path):
     run.log(3, {"loss": 0.25})
     session.update()
     session.close()
-    sync(logger, [run], print)
+    sync_runs(logger, [run], print)
     assert curve(logger) == [(1, 1.0), (2, 0.5), (3, 0.25)]
-    assert sync(logger, [run], print) == {"same": 1}
+    assert sync_runs(logger, [run], print) == {"same": 1}
     assert [path.name for path in Path(logger.place).iterdir()] == ["memory=gru · seed 1 · 00000000"]
 
 
@@ -60,11 +60,11 @@ def test_runs_with_long_names_have_a_folder_each(tmp_path: Path):
     for seed, run in enumerate(runs):
         run.write_manifest({"name": f"{'../optim.weight_decay=0.05 · ' * 5}seed {seed}"})
     for _ in range(2):
-        sync(logger, runs, print)
+        sync_runs(logger, runs, print)
         folders = [path.name for path in Path(logger.place).iterdir()]
         assert sorted(name[-11:] for name in folders) == [f" · {run.id[:8]}" for run in runs]
         assert {len(name) for name in folders} == {120}
-    assert sync(logger, runs, print) == {"same": 2}
+    assert sync_runs(logger, runs, print) == {"same": 2}
 
 
 def test_it_tells_how_a_run_ended_and_what_people_said(tmp_path: Path):
@@ -72,7 +72,7 @@ def test_it_tells_how_a_run_ended_and_what_people_said(tmp_path: Path):
     run.fail("loss is nan")
     set_note(run, "a note")
     an_outdated_evaluation(run)
-    sync(logger, [run], print)
+    sync_runs(logger, [run], print)
     (folder,) = Path(logger.place).iterdir()
     texts = {tag.split("/")[0]: text for tag, _, text in events(folder) if isinstance(text, str)}
     assert (texts["status"], texts["reason"], texts["note"]) == ("failed", "loss is nan", "a note")

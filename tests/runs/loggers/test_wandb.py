@@ -13,7 +13,7 @@ from fake_logger import a_run, an_outdated_evaluation
 from processes import until
 
 from memmlp.common.files import write_json
-from memmlp.runs.loggers.logger import Session, sync
+from memmlp.runs.loggers.logger import Session, sync_runs
 from memmlp.runs.loggers.wandb import WandB
 from memmlp.runs.lookup import add_tags
 
@@ -90,8 +90,8 @@ def test_a_failed_run_with_its_curve_name_and_tags_once(tmp_path: Path):
     session.close()
     run.fail("loss is nan")
     an_outdated_evaluation(run)
-    assert sync(logger, [run], print) == {"shown": 1}
-    assert sync(logger, [run], print) == {"same": 1}
+    assert sync_runs(logger, [run], print) == {"shown": 1}
+    assert sync_runs(logger, [run], print) == {"same": 1}
     found = records(logger, run.id)
     assert curve(found, "train/loss") == [(1, 1.0), (2, 0.5), (3, 0.25)]
     (begun,) = [record.run for record in found if record.WhichOneof("record_type") == "run"]

@@ -58,7 +58,9 @@ def test_a_torn_line_and_a_dead_owners_lock_are_mended(tmp_path: Path, monkeypat
     with open(journal_path(tmp_path), "ab") as file:
         file.write(b'{"op_code":4,"worker_id":"x"')
     Path(f"{journal_path(tmp_path)}.lock").symlink_to(journal_path(tmp_path))
-    monkeypatch.setattr("memmlp.runs.run.changes", str)  # git, in a changed checkout, is waited for in sleeps
+    monkeypatch.setattr(
+        "memmlp.runs.run.create_code_patch", str
+    )  # git, in a changed checkout, is waited for in sleeps
     monkeypatch.setattr(time, "sleep", sleep)
     to_the_end(open_study(tmp_path), tmp_path)
     again = open_study(tmp_path)
