@@ -24,7 +24,9 @@ from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT, colour_
 IMAGES = Path(__file__).parent / "images"
 COLOURS = ("#d1242f", "#1a7f37", "#0969da")  # of X, Y and Z
 TREE = BodyTree(JOINTS, PARENTS, builtin_rest_joints())
-FACING = SPACES["openxr"].rotations_in(np.eye(3))  # the root of a person who stands and looks forward
+FACING = SPACES["openxr"].convert_rotations_to_amass(
+    np.eye(3)
+)  # the root of a person who stands and looks forward
 RIGHTWARD, FORWARD, UP = np.eye(3)  # of that person
 WIDTH, HEIGHT = 380, 466  # pixels of a panel
 AZIMUTH = np.pi - 0.62
@@ -86,7 +88,7 @@ def standing(local: np.ndarray | None = None) -> np.ndarray:
     """Return the joints (22, 3) of a person who looks forward, in T-pose or with local rotations."""
     turns = np.tile(np.eye(3), (len(JOINTS), 1, 1)) if local is None else local.copy()
     turns[0] = FACING @ turns[0]
-    joints = TREE.positions(turns)
+    joints = TREE.compute_positions(turns)
     return joints - [0, 0, (joints[:, 2] - np.array(RADII)).min()]
 
 
@@ -116,7 +118,7 @@ def identities() -> Figure:
         panel.set_title(f"{name}\n{LIES[name]}")
     fix_layout(figure)
     for panel, space in zip(panels.flat, SPACES.values(), strict=True):
-        joints = TREE.positions(rooted(space, np.eye(3)))
+        joints = TREE.compute_positions(rooted(space, np.eye(3)))
         joints = joints - [0, 0, (joints[:, 2] - np.array(RADII)).min()]
         view = View(panel, joints, camera_on(joints))
         view.axes(joints[0] * [1, 1, 0] + np.array([0.75, 0.75, 0.0]), space.world.T, 0.4)
@@ -133,7 +135,7 @@ LIES = {
 def rooted(space: Space, root: np.ndarray) -> np.ndarray:
     """Return local rotations (22, 3, 3) as of AMASS, the root's from a space, the others the identity."""
     turns = np.tile(np.eye(3), (len(JOINTS), 1, 1))
-    return space.pose_in(np.concatenate([root[None], turns[1:]]))
+    return space.convert_pose_to_amass(np.concatenate([root[None], turns[1:]]))
 
 
 def trackers() -> Figure:

@@ -339,14 +339,14 @@ class Prediction:
         Raises:
             InputError: for another kind of file, or if the file can't be written.
         """
-        from memmlp.evaluation.predictions import motion_clip
+        from memmlp.evaluation.predictions import make_clip
         from memmlp.motion.exporting import format_of, write_motion
 
         file = Path(path)
         chosen = format_of(file)
         rotations = self.true_rotations if truth else self.rotations
         positions = self.true_positions if truth else self.positions
-        write_motion(file, motion_clip(self.clip, rotations, positions, self.rest), self.rest, chosen)
+        write_motion(file, make_clip(self.clip, rotations, positions, self.rest), self.rest, chosen)
         return file
 
     def _piece(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:

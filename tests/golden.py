@@ -22,7 +22,7 @@ from torch import Tensor
 
 from memmlp.deploy import latency
 from memmlp.deploy.export import export
-from memmlp.deploy.lower_precision import lower
+from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation import metrics
@@ -204,10 +204,10 @@ def hand(term: NoHand | HandPosition | HandFK) -> Numbers:
 def measured() -> Numbers:
     """A clip's report of both branches, and of its rotations alone."""
     predicted, true = tiny.clip(30, 1)[:, SPARSE_DIM:], tiny.clip(30, 5)
-    report = evaluation.clip_report(tiny.normalizer(World()), predicted, true)
+    report = evaluation.measure_clip(tiny.normalizer(World()), predicted, true)
     found = {f"{branch} {name}": value for branch, of in report.items() for name, value in of.items()}
-    turned = evaluation.local_rotations(predicted)
-    return found | metrics.rotations_report(turned, evaluation.local_rotations(true[:, SPARSE_DIM:]))
+    turned = evaluation.extract_rotations(predicted)
+    return found | metrics.measure_rotations(turned, evaluation.extract_rotations(true[:, SPARSE_DIM:]))
 
 
 def mode(name: str) -> Numbers:
@@ -254,7 +254,7 @@ def lowered(precision: str) -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         exact, other = (Path(folder) / f"{name}.onnx" for name in ("exact", "other"))
         exact.write_bytes(exported("graph.streaming"))
-        lower(precision, exact, other, streaming(tiny.model()), [tiny.clip(40)])
+        write_lower_precision(precision, exact, other, streaming(tiny.model()), [tiny.clip(40)])
         return summary("motion", stream_onnx(OnnxStream(other), tiny.clip(25)))
 
 

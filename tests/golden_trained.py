@@ -126,7 +126,7 @@ def refiner() -> Numbers:
         pieces = RefinerTraining(0, SAGERefinerSettings(6, 2, 20, 6), optim, "frames").draw_pieces(split)
         task = RefinerTask(model, loss(), split, pieces, optim, validate=lambda: {})
         numbers = _trained(task, optim)
-        numbers |= summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])
+        numbers |= summary("stream", evaluation.predict_stream(model.eval(), [tiny.clip(25)])[0])
         found |= {name if kind == "joints" else f"{kind} {name}": value for name, value in numbers.items()}
     return found
 

@@ -29,9 +29,11 @@ def trackers(clip: Clip, rest: np.ndarray, space: Space) -> np.ndarray:
     joints = torch.tensor(rest)
     rotations, positions = forward_kinematics(local, torch.tensor(clip.trans) + joints[0], joints)
     tracked = list(TRACKED)
-    turned = space.rotations_out(rotations[:, tracked].numpy())
+    turned = space.convert_rotations_from_amass(rotations[:, tracked].numpy())
     quaternions = matrix_to_quaternion(turned.reshape(-1, 3, 3)).reshape(-1, 3, 4)
-    return np.concatenate([space.positions_out(positions[:, tracked].numpy()), quaternions], -1)
+    return np.concatenate(
+        [space.convert_positions_from_amass(positions[:, tracked].numpy()), quaternions], -1
+    )
 
 
 def write(path: Path, frames: np.ndarray) -> None:

@@ -12,7 +12,7 @@ import click
 from memmlp.cli.options import config_dir_option, plugins_option
 
 if TYPE_CHECKING:
-    from memmlp.deploy.latency import InTurn
+    from memmlp.deploy.latency import RoundTimes
 
 BASE = "avatar_poser"
 """The network whose times are the unit of all ratios, in the size of its option."""
@@ -83,7 +83,7 @@ def export_all(
     from memmlp.config.build import untrained
     from memmlp.deploy.export import export
     from memmlp.deploy.latency import strip_conversions
-    from memmlp.deploy.lower_precision import lower
+    from memmlp.deploy.lower_precision import write_lower_precision
     from memmlp.motion.body import FRAME_DIM
     from memmlp.networks.streaming import has_stream, streaming
 
@@ -99,18 +99,18 @@ def export_all(
             stream = streaming(model)
             export(stream, files["streaming"], "random")
             for precision in LOWER:
-                lower(precision, files["streaming"], files[precision], stream, clips)
+                write_lower_precision(precision, files["streaming"], files[precision], stream, clips)
         yield from (((name, graph), path) for graph, path in files.items() if path.exists())
 
 
 def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
     """Time all files in turn: their steps, then the whole poses of the deployed ones; see `summarize`."""
-    from memmlp.deploy.latency import time_in_turn
-    from memmlp.live.pose_latency import time_poses_in_turn
+    from memmlp.deploy.latency import time_steps_in_rounds
+    from memmlp.live.pose_latency import time_poses_in_rounds
 
-    times = time_in_turn(paths, rounds, steps)
+    times = time_steps_in_rounds(paths, rounds, steps)
     deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}
-    poses = time_poses_in_turn(deployed, rounds, steps)
+    poses = time_poses_in_rounds(deployed, rounds, steps)
     return [
         {"model": key[0], "variant": key[1]}
         | summarize("", times[key], times[BASE, "network"])
@@ -119,7 +119,7 @@ def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> lis
     ]
 
 
-def summarize(prefix: str, times: InTurn, base: InTurn) -> dict[str, float]:
+def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, float]:
     """Summarize a file's times.
 
     Args:

@@ -199,17 +199,21 @@ def write_exact(opened: OpenedRun, out: Path, form: Form) -> str:
         ClickException: if file and network differ by more than rounding explains; nothing is written then.
     """
     from memmlp.common.progress import announce
-    from memmlp.deploy.parity import TOLERANCE, clips_to_check, differences, is_rounding
-    from memmlp.live.trackers_to_body_graph import full_differences
+    from memmlp.deploy.parity import TOLERANCE, is_rounding, measure_differences, select_parity_clips
+    from memmlp.live.trackers_to_body_graph import measure_full_differences
 
     model, network = load(opened, form)
-    (clip,) = clips_to_check(model, opened.data.open("test").clips())
+    (clip,) = select_parity_clips(model, opened.data.open("test").clips())
     announce(f"export: write {out}, and compare it with torch on a test clip")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
         write_graph(network, path, opened.run.id, form)
         space = form.full and form.full[0]
-        apart = full_differences(model, path, clip, space) if space else differences(model, path, clip)
+        apart = (
+            measure_full_differences(model, path, clip, space)
+            if space
+            else measure_differences(model, path, clip)
+        )
         line = f"differs from torch by at most {float(apart.max()):.1e} on a test clip"
         if not is_rounding(apart):
             raise click.ClickException(
@@ -242,8 +246,8 @@ def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> 
     """
     from memmlp.common.errors import InputError
     from memmlp.common.progress import announce
-    from memmlp.deploy.lower_precision import compare_accuracy, lower
-    from memmlp.live.trackers_to_body_graph import full_differences
+    from memmlp.deploy.lower_precision import compare_accuracy, write_lower_precision
+    from memmlp.live.trackers_to_body_graph import measure_full_differences
     from memmlp.networks.motion_model import StreamingGraph
 
     precision = form.precision
@@ -256,15 +260,15 @@ def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> 
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         exact, other = Path(folder) / "fp32.onnx", Path(folder) / "other.onnx"
         write_graph(network, exact, opened.run.id, form._replace(full=None))
-        lower(precision, exact, other, network, train)
+        write_lower_precision(precision, exact, other, network, train)
         cost = compare_accuracy(exact, other, precision, network.normalizer, test)
         line = f"on test clips {describe_cost(cost, precision)}"
         if not cost["growth"] <= max_growth:
             raise click.ClickException(f"{line}: more than --max-growth {100 * max_growth:g} %, not written")
         if form.full:
             write_graph(network, exact, opened.run.id, form)
-            lower(precision, exact, other, network, train)
-            apart = float(full_differences(model, other, test[0], form.full[0]).max())
+            write_lower_precision(precision, exact, other, network, train)
+            apart = float(measure_full_differences(model, other, test[0], form.full[0]).max())
             line += f"; the full graph differs from torch by at most {apart:.1e} on the first"
             if not apart <= FULL_TOLERANCE:
                 raise click.ClickException(f"{line}, more than {FULL_TOLERANCE:g}: not written")

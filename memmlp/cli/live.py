@@ -184,12 +184,12 @@ def check_options(given: LiveOptions) -> None:
 
 def make_source(given: LiveOptions) -> TrackerSource:
     """Return the source of the poses: packets at a port, or a clip that is played repeatedly."""
-    from memmlp.live.session.sources import ClipSource, PacketSource, from_json, from_osc
+    from memmlp.live.session.sources import ClipSource, PacketSource, parse_json_packet, parse_osc_packet
 
     if given.packets is None:
         return ClipSource(load_clip(given), given.hz)
     kind, port = given.packets
-    parse = from_json if kind == "udp" else from_osc
+    parse = parse_json_packet if kind == "udp" else parse_osc_packet
     return PacketSource(kind.upper(), port, parse, given.space, given.senders, note)
 
 
@@ -201,12 +201,12 @@ def load_clip(given: LiveOptions) -> TrackedClip:
     """
     from memmlp.common.errors import InputError
     from memmlp.deploy.onnx_stream import check_file
-    from memmlp.live.session.sources import TrackedClip, npz_frames
+    from memmlp.live.session.sources import TrackedClip, read_npz_frames
     from memmlp.live.stream import ExportedNetwork
 
     if given.clip is not None and given.clip.endswith(".npz"):
         body = ExportedNetwork(network_file(given)[0]).body.rest
-        return TrackedClip(Path(given.clip).stem, npz_frames(Path(given.clip), body))
+        return TrackedClip(Path(given.clip).stem, read_npz_frames(Path(given.clip), body))
     if given.is_file:
         check_file(Path(given.network))
         raise InputError(f"{given.network}: needs --clip FILE.npz, --udp or --osc; a file has no test clips")
@@ -238,14 +238,16 @@ def serve(given: LiveOptions) -> None:
         stream.offsets = calibration.offsets
         avatar, vrm = given.avatar, None
         if avatar is not None:
-            vrm = page.mannequin_vrm(stream.rest) if avatar == BUILTIN else page.read_vrm(Path(avatar))
-        files = page.read_files(vrm)
+            vrm = page.make_mannequin_vrm(stream.rest) if avatar == BUILTIN else page.read_vrm(Path(avatar))
+        files = page.load_page_files(vrm)
         outputs = make_outputs(given, stream)
         run = None if given.is_file else find_run(given.outputs, given.network)
         remark = warn_if_hardly_trained(count_training_frames(run)) if run else ""
         hub = page.Hub(make_greeting(source, name, outputs, remark, avatar is not None))
-        fitting = Fitting(stream, source.space, given.calibration, hub.publish_state) if source.worn else None
-        ask = fitting.ask if fitting else None
+        fitting = (
+            Fitting(stream, source.space, given.calibration, hub.publish_state) if source.has_wearer else None
+        )
+        ask = fitting.submit_order if fitting else None
         with (
             finish_uninterrupted(outputs.close),
             page.LiveServer(hub, given.port, given.host, given.token, files, ask) as server,
@@ -276,9 +278,9 @@ def combine_calibration(given: LiveOptions, space: SpaceName, stream: Stream) ->
 
     Offsets are left out if they are for another height than that of the options.
     """
-    from memmlp.live.wearer import SAME, Calibration, read_calibration, stature
+    from memmlp.live.wearer import SAME, Calibration, compute_body_height, read_calibration
 
-    body = stature(stream.network.body)
+    body = compute_body_height(stream.network.body)
     saved = Calibration(space)
     if given.calibration is not None and given.calibration.exists():
         saved = read_calibration(given.calibration, space, stream.network.body)

@@ -46,7 +46,7 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
 
 
 def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
-    """Return a run's prediction for a test clip (`prediction_arrays`), computed on one thread of the CPU.
+    """Return a run's prediction for a test clip (`make_prediction_arrays`), on one CPU thread.
 
     Raises:
         InputError: if the run's data is no longer prepared here, or does not have that clip.

@@ -50,9 +50,9 @@ def web(
     from memmlp.common.errors import InputError
     from memmlp.config.build import untrained
     from memmlp.config.open_run import open_run
-    from memmlp.live.web.site import RANDOM, Site, SiteNetwork, check_place
+    from memmlp.live.web.site import RANDOM, Site, SiteNetwork, check_site_folder
 
-    check_place(out)
+    check_site_folder(out)
     opened = [open_run(outputs, run) for run in dict.fromkeys(runs)]
     if len({one.run.id for one in opened}) < len(opened):
         raise InputError(f"{' '.join(runs)}: expected each run only once")
@@ -64,7 +64,7 @@ def web(
         base=base,
         clips=list({clip.key: clip for some in found.values() for clip in some}.values()),
     )
-    size = site.make(out)
+    size = site.write(out)
     click.echo(f"{out}: {size / 1e6:.1f} MB; serve it with: python -m http.server --directory {out}")
     remark_on(*(one.run for one in opened))
 

@@ -61,8 +61,8 @@ def measure_costs(overrides: tuple[str, ...], timed: bool) -> Measured:
         timed: whether its steps are timed, too, as a run's deployment times them.
     """
     from memmlp.deploy.export import export  # slow to import
-    from memmlp.deploy.latency import size
-    from memmlp.live.pose_latency import measure_pose
+    from memmlp.deploy.latency import measure_size
+    from memmlp.live.pose_latency import measure_pose_times
 
     deployment = build_deployment(composed(list(overrides))) or Deployment(latency_steps=1)
     model = untrained(overrides)
@@ -70,7 +70,9 @@ def measure_costs(overrides: tuple[str, ...], timed: bool) -> Measured:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "step.onnx"
         export(network, path, "untrained")
-        record = size(model, network, path)
+        record = measure_size(model, network, path)
         if timed:
-            record |= deployment.times(model, path) | measure_pose(path, deployment.latency_steps)
+            record |= deployment.measure_times(model, path) | measure_pose_times(
+                path, deployment.latency_steps
+            )
     return measure_untrained(overrides, record, describe_environment() | {"device": "cpu", "body": "builtin"})

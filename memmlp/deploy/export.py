@@ -1,9 +1,14 @@
-"""Export of one streaming step to ONNX, with its state explicit.
+"""Export of one streaming step to ONNX. The state is an explicit input and output.
 
-Inputs: `sparse` (1, 54), the world features of the newest frame (order: memmlp.motion.body), and `state.*`,
-all zeros for a fresh start. Outputs: `rotation6d` (1, 22, 6) local rotations, `position` (1, 22, 3) metres in
-the world (from the position branch, or from forward kinematics for networks without one), and the new
-`state.*` under the same names with the suffix `.next`.
+Inputs:
+- `sparse` (1, 54): the world features of the newest frame (memmlp.motion.body defines their order).
+- `state.*`: the states; all zeros at the start.
+
+Outputs:
+- `rotation6d` (1, 22, 6): local rotations.
+- `position` (1, 22, 3): joint positions, metres, world. They come from the position branch, or from forward
+  kinematics if the network does not have a position branch.
+- `state.*.next`: the new states.
 """
 
 from __future__ import annotations
@@ -24,14 +29,14 @@ from torch import Tensor, nn
 
 from memmlp import __version__
 from memmlp.common.lease import publish, temporary_path
-from memmlp.deploy.opsets import NATIVE, convert
-from memmlp.deploy.parity import deterministic
+from memmlp.deploy.opsets import NATIVE, convert_opset
+from memmlp.deploy.parity import disable_sampling
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 
 
 class OneStep(nn.Module):
-    """One step of the live stream with flat inputs and outputs, which ONNX needs."""
+    """One step of the live stream. Its inputs and outputs are flat, because ONNX requires it."""
 
     def __init__(self, model: MotionModel | StreamingGraph):
         super().__init__()
@@ -39,7 +44,7 @@ class OneStep(nn.Module):
         self.names = list(model.initial_state(1))
 
     def forward(self, sparse: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Map `sparse` (1, 54) and the state to (1, 22, 6) rotations, (1, 22, 3) positions, the new state."""
+        """Return rotations (1, 22, 6), positions (1, 22, 3) and the new state for `sparse` (1, 54)."""
         motion, new = self.model.advance(sparse[:, None], dict(zip(self.names, state, strict=True)), 1)
         last = motion[:, -1]
         rotation = last[:, ROTATION].unflatten(-1, (N_JOINTS, 6))
@@ -48,25 +53,25 @@ class OneStep(nn.Module):
 
 
 def export(model: MotionModel | StreamingGraph, path: Path, run_id: str, opset: int = NATIVE) -> None:
-    """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata.
+    """Write the model's streaming step and its metadata as an ONNX file for the CPU in float32.
 
     Raises:
-        InputError: for an opset to which the step can't be converted.
+        InputError: if the step can't be converted to the opset.
     """
     step = OneStep(model.cpu().eval())
     names = [f"state.{name}" for name in step.names]
-    save(
+    export_module(
         step,
         (torch.zeros(1, SPARSE_DIM), *model.initial_state(1).values()),
         ["sparse", *names],
         ["rotation6d", "position", *(f"{name}.next" for name in names)],
         path,
-        metadata(model, run_id),
+        make_metadata(model, run_id),
         opset,
     )
 
 
-def save(
+def export_module(
     step: nn.Module,
     arguments: tuple[Tensor, ...],
     inputs: list[str],
@@ -75,21 +80,21 @@ def save(
     meta: dict[str, str],
     opset: int = NATIVE,
 ) -> None:
-    """Write a step as one ONNX file, atomically.
+    """Write a module as one ONNX file, atomically.
 
     Args:
         step: the module to export.
-        arguments: example arguments of its `forward`.
-        inputs: the arguments' names in the file.
-        outputs: names of its outputs in the file.
+        arguments: example arguments for the `forward` method.
+        inputs: names of the arguments in the file.
+        outputs: names of the outputs in the file.
         path: the file to write.
         meta: the file's metadata.
         opset: one of memmlp.deploy.opsets.OPSETS.
 
     Raises:
-        InputError: for an opset to which the step can't be converted.
+        InputError: if the step can't be converted to the opset.
     """
-    with silence_exporter(), deterministic(step):
+    with silence_exporter(), disable_sampling(step):
         program = torch.onnx.export(
             step,
             arguments,
@@ -102,7 +107,7 @@ def save(
         )
         assert program is not None
         simplify(program.model)
-    graph = convert(program.model_proto, opset)
+    graph = convert_opset(program.model_proto, opset)
     onnx.helper.set_model_props(graph, meta)
     unfinished = temporary_path(path)
     try:
@@ -114,7 +119,7 @@ def save(
 
 @contextmanager
 def silence_exporter() -> Iterator[None]:
-    """Keep the exporter's warnings from users, who can do nothing about them."""
+    """Suppress the exporter's warnings, because users cannot act on them."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -129,16 +134,16 @@ def silence_exporter() -> Iterator[None]:
 
 
 def simplify(model: onnx_ir.Model) -> None:
-    """Fold a graph's constants, and remove unused and duplicate parts and the exporter's notes.
+    """Fold constants, and remove unused and duplicate nodes and the exporter's notes.
 
-    The exporter's own optimiser does the same, but also tries its rewriting rules, which find next to nothing
-    in these graphs and take up to half of an export's time. The notes hold paths of the exporting machine
-    and lines of source code, and were more than half of a small network's file.
+    The exporter's own optimiser also tries rewriting rules. They rarely apply to these graphs, and take up to
+    half of the export time. The notes contain local paths and source code, which can be more than half of a
+    small file.
     """
     common.InlinePass()(model)
     for node in model.graph:
-        # Some layers are a transpose and a product. Folding renames the transposed weight; its name has to
-        # begin with the weight's, by which lower precisions find layers.
+        # Some layers are a transpose and a product. Folding renames the transposed weight. The new name must
+        # begin with the old one, because lower precisions find layers by these names.
         weight = node.inputs[0] if node.op_type == "Transpose" else None
         if weight and weight.is_initializer() and str(weight.name).endswith("weight"):
             node.outputs[0].name = f"{weight.name}.{node.outputs[0].name}"
@@ -159,11 +164,11 @@ SIMPLER = onnx_ir.passes.Sequential(
     common.OutputFixPass(),
     common.NameFixPass(),
 )
-"""The passes that simplify a graph once its constants are folded."""
+"""The passes that simplify a graph after constant folding."""
 
 
-def metadata(model: MotionModel | StreamingGraph, run_id: str) -> dict[str, str]:
-    """Return the metadata by which a program drives the file."""
+def make_metadata(model: MotionModel | StreamingGraph, run_id: str) -> dict[str, str]:
+    """Return the metadata that a program needs to run the exported file."""
     return {
         "joints": json.dumps(JOINTS),
         "parents": json.dumps(PARENTS),

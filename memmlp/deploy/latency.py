@@ -1,4 +1,4 @@
-"""The time of a streaming step on a CPU, and its number of operations."""
+"""CPU time and number of operations of a streaming step."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ from memmlp.motion.normalizer import Change, Normalizer
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 from memmlp.networks.vqvae import EMACodebook
 
-WARM_UP = 30  # steps before the timed ones
-SETTLING = 3  # untimed steps of a file at the start of each round
+WARM_UP = 30  # number of untimed steps at the start
+SETTLING = 3  # number of untimed steps at the start of each round
 Key = TypeVar("Key", bound=Hashable)
 Model = TypeVar("Model", bound=MotionModel)
 YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
 
 
-class InTurn(NamedTuple):
-    """Times of one file that was timed in turn with others.
+class RoundTimes(NamedTuple):
+    """Step times of one file, measured in rounds with other files.
 
     Attributes:
         seconds: the time of each step (rounds, steps), in seconds.
-        core_shares: the share of each round (rounds,) in which the thread had a core.
+        core_shares: the fraction of each round (rounds,) in which the thread ran on a core.
     """
 
     seconds: np.ndarray
     core_shares: np.ndarray
 
 
-def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
+def measure_step_times(path: Path, steps: int = 200) -> dict[str, Any]:
     """Time one step of an exported file on one thread: median and 95th percentile, in milliseconds.
 
-    The step is timed in alternation with the yardstick, a fixed computation, so that their ratio compares
-    machines. At least 200 steps are timed, however few are asked for. `core_share` is the share of that time
-    in which the thread had a core: if it is far less than 1, these times include waiting for other processes.
+    Steps alternate with the yardstick, a fixed computation. The ratio of both times allows comparisons
+    between machines. At least 200 steps are timed. `core_share` is the fraction of the time in which the
+    thread ran on a core. If it is far below 1, the times include waiting for other processes.
     """
-    stream, reference = OnnxStream(path), start_session(yardstick().SerializeToString())
+    stream, reference = OnnxStream(path), start_session(make_yardstick().SerializeToString())
     sparse = np.zeros((1, SPARSE_DIM), np.float32)
     rows = {"input": np.ones(YARDSTICK_SHAPE[:2], np.float32)}
     ours, theirs = [], []
@@ -65,8 +65,8 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
             ours.append(middle - start)
             theirs.append(time.perf_counter() - middle)
     return {
-        **_milliseconds("", ours),
-        **_milliseconds("yardstick_", theirs),
+        **_summarize_times("", ours),
+        **_summarize_times("yardstick_", theirs),
         "ratio_to_yardstick": float(np.median(ours) / np.median(theirs)),
         "core_share": clock.fraction,
         "steps": len(ours),
@@ -74,10 +74,10 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
     }
 
 
-def time_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, InTurn]:
-    """Time the steps of exported files on one thread, with all files in turn in each round.
+def time_steps_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, RoundTimes]:
+    """Time the steps of exported files on one thread. Each round times all files.
 
-    A file's first steps in each round, in which the caches fill, are not counted.
+    The first steps of a file in each round only fill the caches, and are not counted.
     """
     streams = {key: OnnxStream(path) for key, path in paths.items()}
     random = np.random.default_rng(0)
@@ -94,16 +94,18 @@ def time_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key
             seconds[step] = time.perf_counter() - start
         return seconds[SETTLING:]
 
-    return in_turn(paths, rounds, time_round)
+    return time_in_rounds(paths, rounds, time_round)
 
 
-def in_turn(keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.ndarray]) -> dict[Key, InTurn]:
-    """Time files in rounds, all in turn in each, in an order that is reversed after each round.
+def time_in_rounds(
+    keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.ndarray]
+) -> dict[Key, RoundTimes]:
+    """Time all files in each round. The order of the files is reversed after each round.
 
     Args:
-        keys: the files' keys.
-        rounds: how many rounds.
-        time_round: times a file's steps of one round, and returns their seconds (steps,).
+        keys: the keys of the files.
+        rounds: number of rounds.
+        time_round: times the steps of one file in one round, and returns the seconds (steps,).
     """
     order = list(keys)
     seconds: dict[Key, list[np.ndarray]] = {key: [] for key in order}
@@ -114,16 +116,20 @@ def in_turn(keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.nda
             seconds[key].append(time_round(key))
             shares[key].append(clock.fraction)
         order.reverse()
-    return {key: InTurn(np.array(seconds[key]), np.array(shares[key])) for key in seconds}
+    return {key: RoundTimes(np.array(seconds[key]), np.array(shares[key])) for key in seconds}
 
 
-def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> dict[str, Any]:
-    """Measure a network: its parameters, MACs and FLOPs, the MACs of its exported step, the file's bytes.
+def measure_size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> dict[str, Any]:
+    """Return the number of parameters, MACs and FLOPs of a network, and the size of its file.
 
-    "parameters" are those that training changes; "parameters_with_vqvae" are all, with frozen ones and
-    code-vectors. "macs" and "flops" are the network's, which papers count; "step_macs" are those of the
-    exported graph. Only matrix products are counted; a FLOP is one multiplication or addition, a MAC is one
-    of each.
+    - "parameters": the parameters that training changes.
+    - "parameters_with_vqvae": all parameters, including frozen parameters and code-vectors.
+    - "macs", "flops": the operations of the network, as papers report them.
+    - "step_macs": the operations of the exported graph.
+    - "onnx_bytes": the size of the file.
+
+    Only matrix products are counted. A FLOP is one multiplication or addition. A MAC is one multiplication
+    and one addition.
 
     Args:
         model: the network as it was trained.
@@ -145,11 +151,13 @@ def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> 
 
 @torch.no_grad()
 def count_macs(model: MotionModel | StreamingGraph) -> int:
-    """Count the multiply-adds of the matrix products of one streaming step."""
+    """Count the multiply-adds (MACs) in the matrix products of one streaming step."""
     counter = FlopCounterMode(display=False)
     counter.flop_registry = {**flop_registry, **CPU_FORMULAS}
     fast = mha.get_fastpath_enabled()
-    mha.set_fastpath_enabled(False)  # whole layers as one kernel, without its products
+    mha.set_fastpath_enabled(
+        False
+    )  # the fast path runs whole layers as one kernel, which hides their products
     try:
         with counter:
             model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
@@ -158,25 +166,27 @@ def count_macs(model: MotionModel | StreamingGraph) -> int:
     return counter.get_total_flops() // 2
 
 
-def _lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest) -> int:
-    """Count an LSTM's FLOPs from its arguments' shapes.
+def _count_lstm_flops(
+    x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest
+) -> int:
+    """Count the FLOPs of an LSTM.
 
-    These are inputs (n, B, inputs), their weights (4 k, inputs), and the hidden state's weights (4 k, k).
+    The arguments are shapes: inputs (n, B, inputs), input weights (4 k, inputs), hidden weights (4 k, k).
     """
     return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
 
 
 CPU_FORMULAS = {
-    torch.ops.aten.mkldnn_rnn_layer: shape_wrapper(_lstm_flops),
+    torch.ops.aten.mkldnn_rnn_layer: shape_wrapper(_count_lstm_flops),
     torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: flop_registry[
         torch.ops.aten._scaled_dot_product_flash_attention
     ],
 }
-"""Formulas of CPU kernels that torch's own counter counts as 0."""
+"""FLOP formulas of CPU kernels that torch counts as 0."""
 
 
-def yardstick() -> onnx.ModelProto:
-    """Make the yardstick, a fixed reference network of matrix products and ReLUs."""
+def make_yardstick() -> onnx.ModelProto:
+    """Make the yardstick: a fixed reference network of matrix products and ReLUs."""
     rows, width, layers = YARDSTICK_SHAPE
     weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
     nodes, name = [], "input"
@@ -195,8 +205,8 @@ def yardstick() -> onnx.ModelProto:
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
 
 
-def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:
-    """Return median and 95th percentile of seconds, in milliseconds, with the prefix before their keys."""
+def _summarize_times(prefix: str, seconds: list[float]) -> dict[str, float]:
+    """Return the median and the 95th percentile in milliseconds. The prefix starts their keys."""
     return {
         f"{prefix}median_ms": 1000 * float(np.median(seconds)),
         f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
@@ -204,7 +214,7 @@ def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:
 
 
 class NoConversion(Normalizer):
-    """A normalizer that changes nothing: inputs are features already, outputs stay in network space.
+    """A normalizer that converts nothing. Inputs and outputs stay in network space.
 
     Joint positions are zeros.
     """
@@ -232,10 +242,10 @@ class NoConversion(Normalizer):
 
 
 def strip_conversions(model: Model) -> Model:
-    """Copy a network without the conversions before and after it and without its forward kinematics.
+    """Copy a network, and remove its input and output conversions and its forward kinematics.
 
-    Papers time this: from features to the network's own outputs. Computations with joints between the
-    network's layers (AvatarJLM's tokens, MANIKIN's limbs) stay. The copy is only good for timing.
+    Papers time a network in this way: from its features to its outputs. Joint computations between layers
+    (AvatarJLM's tokens, MANIKIN's limbs) stay. The copy is only valid for timing.
     """
     made = copy.deepcopy(model)
     for module in list(made.modules()):

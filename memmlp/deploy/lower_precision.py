@@ -1,7 +1,7 @@
-"""Lower precision of an exported stream: int8, int8 in blocks, fp16; and what that costs in accuracy.
+"""Lower precision of an exported stream (int8, int8 in blocks, fp16), and its loss of accuracy.
 
-Only a network's inner layers change. The modules at its ends stay in float32, as the graph says
-(`StreamingGraph.float32_modules`): the stem's input has outliers, and rounding in the heads would show as
+Only the inner layers of a network change. The first and last modules stay in float32
+(`StreamingGraph.float32_modules`). The input of the stem has outliers, and rounding in the heads would cause
 jitter.
 """
 
@@ -23,52 +23,53 @@ from memmlp.common.files import atomic_write
 from memmlp.common.lease import publish, temporary_path
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.deploy.opsets import Constants
+from memmlp.deploy.opsets import GraphConstants
 from memmlp.deploy.parity import stream_onnx
-from memmlp.evaluation.metrics import positions_report
-from memmlp.evaluation.modes import joint_positions, rotations_report
+from memmlp.evaluation.metrics import measure_positions
+from memmlp.evaluation.modes import extract_positions, measure_rotation_branch
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import StreamingGraph
 from memmlp.runs.deployment_folder import is_accurate_enough
 
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
-TEST_FRAMES = 20_000  # accuracy is measured on at most this many
+TEST_FRAMES = 20_000  # maximum number of frames for measuring accuracy
 LARGEST = float(np.finfo(np.float16).max)
-BLOCK = 32  # inputs of a product that share a scale; the least that all of ONNX Runtime's kernels know
-LEVELS, ZERO = 127, 128  # a weight w is stored as the byte 128 + 127 w / (largest of its block)
+BLOCK = 32  # number of inputs that share a scale; the minimum that all ONNX Runtime kernels support
+LEVELS, ZERO = 127, 128  # the byte of a weight w is 128 + 127 w / (largest weight in its block)
 DOMAIN = "com.microsoft"
 INTEGER_ACCURACY = 4  # the accuracy level at which MatMulNBits multiplies integers
 
 
-def lower(precision: str, source: Path, path: Path, network: StreamingGraph, train: Sequence[Tensor]) -> None:
-    """Write a file with lower precision.
+def write_lower_precision(
+    precision: str, source: Path, path: Path, network: StreamingGraph, train: Sequence[Tensor]
+) -> None:
+    """Write an ONNX file with lower precision.
 
     Args:
         precision: "int8", "int8_blocks" or "fp16".
         source: the float32 ONNX file of a streaming graph.
         path: the file to write.
-        network: the graph, which says which of its modules stay in float32.
-        train: training clips (N, 252), to calibrate int8.
+        network: the graph; its `float32_modules` stay in float32.
+        train: training clips (N, 252); they calibrate int8.
 
     Raises:
-        InputError: for a graph without inner layers, or a weight that sixteen bits cannot hold.
+        InputError: if the graph does not have inner layers, or a weight is out of range for fp16.
     """
     model = onnx.load(source)
     inner = find_inner_layers(model, network.float32_modules)
     if precision == "int8":
-        _quantise(source, path, inner, train)
+        _quantise_to_int8(source, path, inner, train)
     else:
-        change = store_in_blocks if precision == "int8_blocks" else halve
+        change = convert_to_int8_blocks if precision == "int8_blocks" else convert_to_fp16
         atomic_write(path, change(model, inner).SerializeToString())
 
 
 def find_inner_layers(model: ModelProto, kept: Sequence[str]) -> list[str]:
-    """Return the names of the nodes that multiply by a layer's weight, except those in the kept modules.
+    """Return the names of the nodes that multiply by a layer's weight, outside of the kept modules.
 
     Raises:
-        InputError: if there are no such nodes. The file would be the float32 one by another name, and ONNX
-            Runtime takes all nodes where it gets no names.
+        InputError: if there are no such nodes. ONNX Runtime would quantise all nodes for an empty list.
     """
     weights = {tensor.name for tensor in model.graph.initializer}
     beginnings = tuple(f"model.{name}." for name in kept)
@@ -81,14 +82,14 @@ def find_inner_layers(model: ModelProto, kept: Sequence[str]) -> list[str]:
         and not node.input[1].startswith(beginnings)
     ]
     if not inner:
-        raise InputError("export.precision: must be fp32; no layer lies between this network's ends")
+        raise InputError("export.precision: must be fp32; this network does not have inner layers")
     return inner
 
 
 class ActivationSamples(CalibrationDataReader):
-    """Calibration samples, which are inputs and states: every twentieth frame of streams of clips (N, 252).
+    """Calibration samples: the inputs and states at every twentieth frame of streamed clips (N, 252).
 
-    The middle 400 frames of each clip are streamed.
+    At most 40 clips are streamed, and the middle 400 frames of each clip.
     """
 
     def __init__(self, path: Path, clips: Sequence[Tensor]):
@@ -110,15 +111,16 @@ class ActivationSamples(CalibrationDataReader):
                 stream.step(sparse)
 
 
-def _quantise(source: Path, path: Path, inner: list[str], clips: Sequence[Tensor]) -> None:
-    """Write int8 by ONNX Runtime's static quantisation.
+def _quantise_to_int8(source: Path, path: Path, inner: list[str], clips: Sequence[Tensor]) -> None:
+    """Write an int8 file by ONNX Runtime's static quantisation.
 
-    Weights get one scale for each output, and seven bits: with eight bits, CPUs without VNNI overflow, since
-    they add products in sixteen bits. Activations get eight bits and one scale, found by streaming clips.
+    Weights have seven bits and one scale per output. CPUs without VNNI add products in sixteen bits, and
+    would overflow with eight-bit weights. Activations have eight bits and one scale, calibrated on streamed
+    clips.
     """
     unfinished, root = temporary_path(path), logging.getLogger()
     level = root.level
-    root.setLevel(logging.ERROR)  # it advises to prepare the graph, which torch's exporter has done already
+    root.setLevel(logging.ERROR)  # hide the advice to prepare the graph; torch's exporter did it already
     try:
         quantize_static(
             source,
@@ -139,24 +141,24 @@ def _quantise(source: Path, path: Path, inner: list[str], clips: Sequence[Tensor
         unfinished.unlink(missing_ok=True)
 
 
-def store_in_blocks(model: ModelProto, inner: Sequence[str]) -> ModelProto:
-    """Return the graph with 8-bit weights that have a scale for every 32 inputs of an output.
+def convert_to_int8_blocks(model: ModelProto, inner: Sequence[str]) -> ModelProto:
+    """Return the graph with 8-bit weights. Each output of a layer has a scale for every 32 inputs.
 
-    A product's inputs are rounded to eight bits while it is computed, with a scale for every 32 of them
-    (`MatMulNBits`, ONNX Runtime's own operator). So there is no calibration, and a layer is one operation
-    instead of four. It suits networks without a window, whose products have one row; products with a window's
-    rows are slower than in float32.
+    ONNX Runtime's operator `MatMulNBits` also rounds the inputs to eight bits at run time, with a scale for
+    every 32 inputs. So calibration is not needed, and a layer is one operation instead of four. This is fast
+    for networks without a window, because their products have one row. Products with a row per frame of a
+    window are slower than in float32.
     """
-    constants, nodes = Constants(model.graph), list[NodeProto]()
+    constants, nodes = GraphConstants(model.graph), list[NodeProto]()
     for node in model.graph.node:
         if node.name not in inner:
             nodes.append(node)
             continue
         values, name, *bias = node.input
-        weight = constants.value(name)
+        weight = constants.get_value(name)
         if not any(one.name == "transB" and one.i for one in node.attribute):
             weight = weight.T
-        codes, scales = blocks(weight)
+        codes, scales = quantise_in_blocks(weight)
         stored = constants.add(f"{name}.blocks", codes), constants.add(f"{name}.scales", scales.reshape(-1))
         product = helper.make_node(
             "MatMulNBits",
@@ -177,8 +179,8 @@ def store_in_blocks(model: ModelProto, inner: Sequence[str]) -> ModelProto:
     return model
 
 
-def blocks(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a weight (outputs, inputs) as bytes (outputs, blocks, 32) and scales (outputs, blocks).
+def quantise_in_blocks(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quantise a weight (outputs, inputs) to bytes (outputs, blocks, 32) and scales (outputs, blocks).
 
     The last block is padded with zeros.
     """
@@ -189,78 +191,83 @@ def blocks(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (np.rint(steps) + ZERO).astype(np.uint8), scales.astype(np.float32)
 
 
-def halve(model: ModelProto, inner: Sequence[str]) -> ModelProto:
-    """Return the graph with the inner layers' weights and products in fp16, which halves the file's size.
+def convert_to_fp16(model: ModelProto, inner: Sequence[str]) -> ModelProto:
+    """Return the graph with the weights and products of the inner layers in fp16. This halves the file size.
 
-    As under autocast, these products have 16-bit inputs and outputs, and everything between them stays
-    float32: sums, normalisations, inputs, outputs and states. A world position of 4 m has a resolution of
-    4 mm in sixteen bits. ONNX Runtime's converter would round every value between two nodes that stay
-    float32.
+    The inputs and outputs of these products are fp16, like under autocast. Sums, normalisations, inputs,
+    outputs and states stay float32, because fp16 resolves a world position of 4 m only to 4 mm. ONNX
+    Runtime's own converter would also round these values.
     """
-    constants, nodes, halves = Constants(model.graph), list[NodeProto](), dict[str, str]()
+    constants, nodes, halves = GraphConstants(model.graph), list[NodeProto](), dict[str, str]()
     for node in model.graph.node:
         if node.name not in inner:
             nodes.append(node)
             continue
         for index, name in enumerate(node.input):
             if name in constants:
-                weight = constants.value(name)
+                weight = constants.get_value(name)
                 if not np.abs(weight).max() <= LARGEST:
-                    raise InputError(f"{name}: has weights beyond {LARGEST:.0f}; use export.precision=fp32")
+                    raise InputError(
+                        f"export.precision=fp16: must be fp32; {name} has weights above {LARGEST:.0f}"
+                    )
                 node.input[index] = constants.add(f"{name}.half", weight.astype(np.float16))
             else:
                 if name not in halves:
                     halves[name] = f"{name}.half"
-                    nodes.append(_cast(name, halves[name], TensorProto.FLOAT16))
+                    nodes.append(_make_cast_node(name, halves[name], TensorProto.FLOAT16))
                 node.input[index] = halves[name]
         output = node.output[0]
         node.output[0] = f"{output}.made"
-        nodes += [node, _cast(node.output[0], output, TensorProto.FLOAT)]
+        nodes += [node, _make_cast_node(node.output[0], output, TensorProto.FLOAT)]
     constants.replace_nodes(nodes)
     del model.graph.value_info[:]
     return model
 
 
-def _cast(name: str, output: str, kind: int) -> NodeProto:
+def _make_cast_node(name: str, output: str, kind: int) -> NodeProto:
     return helper.make_node("Cast", [name], [output], f"{output}.cast", to=kind)
 
 
 def measure_accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
-    """Measure the rotation branch's metrics, streamed in ONNX Runtime: means over clips (N, 252).
+    """Stream clips (N, 252) in ONNX Runtime, and return the mean metrics of the rotation branch.
 
-    "position MPJPE" is that of the file's positions: of the position branch, where the network has one.
-    At most 20,000 frames are streamed; if there are more, the first part of each clip is, with the same share
-    of all clips.
+    "position MPJPE" is the MPJPE of the file's output `position`. At most 20,000 frames are streamed. If the
+    clips have more frames, the same fraction of each clip is streamed, from its start.
     """
     stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
     rows = []
     for clip in progress_bar(clips, "measuring"):
         truth = clip[: max(int(share * len(clip)), 2)]
         motion = stream_onnx(stream, truth)
-        positions = joint_positions(motion), joint_positions(truth[:, SPARSE_DIM:])
-        position = positions_report(*positions)["MPJPE"]
-        rows.append(rotations_report(normalizer, motion, truth) | {"position MPJPE": position})
+        positions = extract_positions(motion), extract_positions(truth[:, SPARSE_DIM:])
+        position = measure_positions(*positions)["MPJPE"]
+        rows.append(measure_rotation_branch(normalizer, motion, truth) | {"position MPJPE": position})
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
 def compare_accuracy(
     exact: Path, other: Path, precision: str, normalizer: Normalizer, clips: Sequence[Tensor]
 ) -> dict[str, Any]:
-    """Measure on test clips what lower precision costs in accuracy.
+    """Measure the loss of accuracy from lower precision on test clips.
 
     Args:
         exact: the float32 file.
-        other: the same network with lower precision.
-        precision: name of the lower precision, such as "int8".
+        other: the file of the same network in lower precision.
+        precision: the name of the lower precision, such as "int8".
         normalizer: the network's normalizer.
-        clips: frames (N, 252) of each clip.
+        clips: test clips (N, 252).
 
     Returns:
-        The metrics of both files, the relative growth of MPJPE, of the branch in which that is larger, and of
-        Jitter, and whether the other file may be the default (`is_accurate_enough`).
+        "fp32" and the precision's name: the metrics of both files.
+        "growth": the relative growth of MPJPE, for the branch with the larger growth.
+        "jitter_growth": the relative growth of Jitter.
+        "default": whether the file in lower precision may be the default (`is_accurate_enough`).
     """
     before, after = (measure_accuracy(path, normalizer, clips) for path in (exact, other))
     growths = {name: after[name] / before[name] - 1 for name in ("MPJPE", "position MPJPE", "Jitter")}
     jitter = growths.pop("Jitter")
-    grown = {"growth": float(np.max(list(growths.values()))), "jitter_growth": jitter}  # NaN if either is
+    grown = {
+        "growth": float(np.max(list(growths.values()))),
+        "jitter_growth": jitter,
+    }  # NaN if one growth is NaN
     return {"fp32": before, precision: after, **grown, "default": is_accurate_enough(grown)}

@@ -1,8 +1,8 @@
-"""Conversion of exported graphs to other ONNX operator sets: older ones for older engines, newer on demand.
+"""Conversion of exported graphs to other ONNX operator sets (opsets). Older engines need older opsets.
 
-torch's exporter writes opset 18. onnx's own converter makes newer sets. It cannot go down for the operators
-of these graphs, so this module does: it rewrites the few operators that have another form in the older opset,
-and rejects a graph with any other operator that differs.
+torch's exporter writes opset 18. The onnx package converts to newer opsets, but cannot convert the operators
+of these graphs to older opsets. So this module rewrites the operators that differ in the older opset. It
+rejects a graph with an operator that it cannot rewrite.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ NATIVE = 18
 """The opset that torch's exporter writes."""
 
 OPSETS = range(15, 27)
-"""The opsets to which a graph can be converted; ONNX Runtime 1.31 does not read newer ones."""
+"""The supported opsets. ONNX Runtime 1.31 does not read newer opsets."""
 
 WIDENED = ("Identity", "LeakyRelu", "Where")
-"""Operators whose newer versions only take more number types."""
+"""Operators with new versions that only support more number types."""
 
 
-class Constants:
-    """The constants of a graph; new ones can be added."""
+class GraphConstants:
+    """The constants of a graph. New constants can be added."""
 
     def __init__(self, graph: GraphProto):
         self.graph = graph
         self.known = {tensor.name: tensor for tensor in graph.initializer}
 
     def __contains__(self, name: str) -> bool:
-        """Return whether a constant has that name."""
+        """Return whether the graph has a constant with this name."""
         return name in self.known
 
-    def value(self, name: str) -> np.ndarray:
+    def get_value(self, name: str) -> np.ndarray:
         """Return the value of a constant."""
         return numpy_helper.to_array(self.known[name])
 
     def add(self, name: str, value: np.ndarray) -> str:
-        """Add a constant unless one has that name, and return its name."""
+        """Add a constant unless the name exists, and return the name."""
         if name not in self.known:
             self.graph.initializer.append(numpy_helper.from_array(value, name))
             self.known[name] = self.graph.initializer[-1]
         return name
 
     def replace_nodes(self, nodes: list[NodeProto]) -> None:
-        """Replace the graph's nodes, and remove the constants that none of them uses."""
+        """Replace all nodes of the graph, and remove unused constants."""
         del self.graph.node[:]
         self.graph.node.extend(nodes)
         used = {name for node in nodes for name in node.input}
@@ -59,11 +59,12 @@ class Constants:
         self.graph.initializer.extend(kept)
 
 
-def convert(model: ModelProto, opset: int) -> ModelProto:
-    """Return a graph of opset 18 in another opset; it computes the same.
+def convert_opset(model: ModelProto, opset: int) -> ModelProto:
+    """Convert a graph from opset 18 to another opset. The results of the graph stay the same.
 
     Raises:
-        InputError: for an opset that is not one of OPSETS, or that the installed onnx does not know.
+        InputError: if the opset is not in OPSETS, is unknown to the installed onnx package, or does not
+            support the graph.
     """
     newest = min(OPSETS[-1], onnx.defs.onnx_opset_version())
     if not OPSETS[0] <= opset <= newest:
@@ -75,42 +76,44 @@ def convert(model: ModelProto, opset: int) -> ModelProto:
         return model
     lowered = ModelProto()
     lowered.CopyFrom(model)
-    constants = Constants(lowered.graph)
-    constants.replace_nodes([node for old in model.graph.node for node in _rewrite(old, opset, constants)])
+    constants = GraphConstants(lowered.graph)
+    constants.replace_nodes(
+        [node for old in model.graph.node for node in _rewrite_node(old, opset, constants)]
+    )
     del lowered.opset_import[:]
     lowered.opset_import.append(helper.make_opsetid("", opset))
     lowered.ir_version = helper.find_min_ir_version_for(lowered.opset_import)
     return lowered
 
 
-def _rewrite(node: NodeProto, opset: int, constants: Constants) -> Iterator[NodeProto]:
-    """Yield the nodes by which an older opset expresses a node of opset 18."""
+def _rewrite_node(node: NodeProto, opset: int, constants: GraphConstants) -> Iterator[NodeProto]:
+    """Yield the nodes in an older opset that replace a node of opset 18."""
     kind, attributes = node.op_type, {a.name: helper.get_attribute_value(a) for a in node.attribute}
-    if kind in WIDENED or _since(kind, opset) == _since(kind, NATIVE):
+    if kind in WIDENED or _find_version(kind, opset) == _find_version(kind, NATIVE):
         yield node
-    elif kind.startswith("Reduce"):  # whose axes were an attribute
-        keep, axes = attributes.get("keepdims", 1), constants.value(node.input[1]).tolist()
+    elif kind.startswith("Reduce"):  # the axes were an attribute
+        keep, axes = attributes.get("keepdims", 1), constants.get_value(node.input[1]).tolist()
         yield helper.make_node(kind, node.input[:1], node.output, node.name, axes=axes, keepdims=keep)
-    elif kind == "Split":  # without sizes, the parts are equal; their number was not given
+    elif kind == "Split":  # without sizes, all parts are equal; older opsets have no number of parts
         yield helper.make_node(kind, node.input, node.output, node.name, axis=attributes.get("axis", 0))
-    elif kind == "Pad":  # which had no axes
+    elif kind == "Pad":  # it did not have axes
         assert len(node.input) <= 3 or not node.input[3]
         yield node
     elif kind == "LayerNormalization":
         yield from _write_out_normalization(node, attributes, constants)
     else:
-        raise InputError(f"opset={opset}: has another form of {kind}, which this graph needs; use {NATIVE}")
+        raise InputError(f"opset={opset}: must be {NATIVE}; this graph needs a newer form of {kind}")
 
 
-def _since(kind: str, opset: int) -> int:
-    """Return the opset that introduced an operator's form in a given opset; 0 if it lacks the operator."""
+def _find_version(kind: str, opset: int) -> int:
+    """Return the version of an operator in an opset; 0 if the opset does not have the operator."""
     return onnx.defs.get_schema(kind, opset).since_version if onnx.defs.has(kind, opset) else 0
 
 
 def _write_out_normalization(
-    node: NodeProto, attributes: dict[str, Any], constants: Constants
+    node: NodeProto, attributes: dict[str, Any], constants: GraphConstants
 ) -> Iterator[NodeProto]:
-    """Yield a LayerNormalization in the operators before opset 17, in a form that runtimes fuse again."""
+    """Yield the operators that replace a LayerNormalization before opset 17. Runtimes can fuse them."""
     assert attributes.get("axis", -1) == -1
     name, x = node.output[0], node.input[0]
     epsilon = constants.add(f"{name}.epsilon", np.array(attributes.get("epsilon", 1e-5), np.float32))

@@ -1,4 +1,4 @@
-"""Parity: proof that an ONNX file computes what the network does, by streaming a whole clip through both."""
+"""Parity check: stream the same clip through an ONNX file and torch, and compare the results."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ from memmlp.motion.geometry import one_thread
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import Blend
 
-TOLERANCE = 1e-4  # on 6D components and metres
-ROUNDING = 10 * TOLERANCE  # the largest median difference that rounding explains; see `is_rounding`
-MARGIN = 60  # frames that are compared with a full past
+TOLERANCE = 1e-4  # for 6D components and metres
+ROUNDING = 10 * TOLERANCE  # the largest median difference from rounding; see `is_rounding`
+MARGIN = 60  # number of frames to compare after the network's history is full
 
 
 @contextmanager
-def deterministic(model: nn.Module) -> Iterator[None]:
-    """Replace a sampled m (reading 7) by its mean, since torch and ONNX Runtime can't share random draws."""
+def disable_sampling(model: nn.Module) -> Iterator[None]:
+    """Replace a sampled m by its mean (docs/readings.md, no. 7).
+
+    torch and ONNX Runtime cannot use the same random numbers.
+    """
     sampled = [module for module in model.modules() if isinstance(module, Blend) and module.sampled]
     values = [blend.value for blend in sampled]
     try:
@@ -37,40 +40,41 @@ def deterministic(model: nn.Module) -> Iterator[None]:
             blend.value = value
 
 
-def clips_to_check(model: MotionModel, clips: Sequence[Tensor], count: int = 1) -> list[Tensor]:
-    """Return the longest clips (N, 252), each cut to a length that shows the network with a full past.
+def select_parity_clips(model: MotionModel, clips: Sequence[Tensor], count: int = 1) -> list[Tensor]:
+    """Return the longest clips (N, 252), cut to the length that a parity check needs.
 
-    On a short clip a graph that forgets its past, or never drops it, computes what the network does. They are
-    at least as long as the first clip, where they can be.
+    The length includes frames after the network's history is full. Errors in handling the history do not
+    show on shorter clips. The length is at least the length of the first clip.
 
     Args:
         model: the trained network.
         clips: test clips (N, 252).
-        count: how many clips to return; 0 for all, whole.
+        count: number of clips to return; 0 for all clips, uncut.
     """
     if not count:
         return list(clips)
-    enough = max(frames_of_full_past(model) + MARGIN, len(clips[0]))
+    enough = max(count_frames_until_past_is_full(model) + MARGIN, len(clips[0]))
     return [clip[:enough] for clip in sorted(clips, key=len, reverse=True)[:count]]
 
 
-def frames_of_full_past(model: MotionModel) -> int:
-    """Return the number of frames after which nothing of the fresh start is left in the network's past."""
+def count_frames_until_past_is_full(model: MotionModel) -> int:
+    """Return the number of frames after which the network's history contains only real frames."""
     return model.past_frames + model.frames
 
 
-def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
+def measure_largest_difference(model: MotionModel, path: Path, clip: Tensor) -> float:
     """Return the largest difference between torch and ONNX Runtime over a clip (N, 252)."""
-    return float(differences(model, path, clip).max())
+    return float(measure_differences(model, path, clip).max())
 
 
 @torch.no_grad()
-def differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
+def measure_differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
     """Return each frame's largest difference (N,) between torch and ONNX Runtime over a clip (N, 252).
 
-    Each has its own history. The positions of a network without a position branch are compared with the
-    positions that follow, in float64, from ONNX Runtime's rotations. Where 6D columns are almost parallel,
-    which an untrained network sometimes produces, forward kinematics would amplify rounding a hundredfold.
+    torch and ONNX Runtime each use their own history. If the network does not have a position branch, the
+    expected positions are computed in float64 from ONNX Runtime's rotations. Otherwise, forward kinematics
+    would amplify rounding errors a hundredfold for 6D columns that are almost parallel. Untrained networks
+    sometimes produce such columns.
     """
     model, clip = model.cpu().eval(), clip.cpu()
     expected, found = stream_torch(model, clip), stream_onnx(OnnxStream(path), clip)
@@ -82,25 +86,25 @@ def differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
 
 
 def is_rounding(apart: Tensor) -> bool:
-    """Return whether each frame's differences (N,) between torch and ONNX Runtime are due to rounding.
+    """Return whether the differences (N,) between torch and ONNX Runtime are rounding errors.
 
-    Differences of at most TOLERANCE are. Larger ones are, too, if half of the frames differ by at most
-    ROUNDING. A rotation can be ill-conditioned, such as a hip's swivel about a straight leg. Many steps can
-    follow each other (a diffusion). A latent can be equally far from two code-vectors, so that rounding
-    chooses.
+    They are if all are at most TOLERANCE, or if their median is at most ROUNDING. Some frames can differ more
+    for these reasons:
+    - A rotation is ill-conditioned, such as the swivel of a straight leg.
+    - A network has many consecutive steps (a diffusion).
+    - A latent has the same distance to two code-vectors, and rounding decides between them.
     """
     return bool(apart.max() <= TOLERANCE or apart.median() <= ROUNDING)
 
 
 @torch.no_grad()
 def stream_torch(model: MotionModel, clip: Tensor) -> Tensor:
-    """Return the world motion (N, 198) that torch's network streams for a clip's inputs (N, 252 or 54).
+    """Return the world motion (N, 198) of the torch network, streamed over a clip (N, 252 or 54).
 
-    One thread computes it: a frame is little work, which several threads do more slowly, and far more slowly
-    on a busy machine.
+    It runs on one thread, because several threads are slower for such small computations.
     """
     state, motions = model.initial_state(1), []
-    with deterministic(model), one_thread():
+    with disable_sampling(model), one_thread():
         for sparse in progress_bar(clip[:, None, None, :SPARSE_DIM], "check"):
             motion, state = model.advance(sparse, state)
             motions.append(motion[0, -1])
@@ -108,7 +112,7 @@ def stream_torch(model: MotionModel, clip: Tensor) -> Tensor:
 
 
 def stream_onnx(stream: OnnxStream, clip: Tensor) -> Tensor:
-    """Return the world motion (N, 198) that a fresh ONNX stream makes of a clip's inputs (N, 252 or 54)."""
+    """Reset an ONNX stream, and return its world motion (N, 198) for a clip (N, 252 or 54)."""
     stream.reset()
     outputs = [stream.step(sparse) for sparse in clip[:, None, :SPARSE_DIM].numpy()]
     return torch.tensor(np.stack([np.concatenate([r.ravel(), p.ravel()]) for r, p in outputs]))

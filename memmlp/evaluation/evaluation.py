@@ -16,19 +16,19 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.motion_model import MotionModel
 
-PICTURE_FRAMES = 600  # the first 10 s
+PICTURE_FRAMES = 600  # 10 s
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How a network is evaluated.
+    """The settings of an evaluation.
 
     Attributes:
-        modes: the evaluation modes, out of "stream" and "window".
-        batch: the largest number of clips that are evaluated side by side.
-        ik: inverse kinematics, whose result is reported as one more branch.
-        seed: seed for networks that draw random numbers, such as a sampled blend.
-        metrics: custom metrics, by name.
+        modes: the evaluation modes: "stream", "window" or both.
+        batch: maximum number of clips that are evaluated in parallel.
+        ik: inverse kinematics; its result is reported like an additional branch.
+        seed: random seed for networks with random outputs, such as a sampled blend.
+        metrics: the custom metrics by name.
     """
 
     modes: Sequence[str]
@@ -41,30 +41,30 @@ class Evaluation:
         """Compute the metrics in a mode.
 
         Returns:
-            "mean", the metrics by branch, and "clips", a row for each clip with its metrics by branch; and
-            "offline" for a network that can't run as a stream.
+            "mean": the metrics by branch. "clips": a row per clip with its metrics by branch. "offline":
+            True, only present if the network uses future frames.
         """
-        torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
+        torch.manual_seed(self.seed)  # each mode starts from the same seed
         clips = test.clips()
         rows: list[dict[str, Any]] = []
         for index, motion in enumerate(modes.predict(model, clips, mode, self.batch)):
             facts = {"name": test.names[index], "group": test.groups[index]}
             facts |= {"source": test.sources[index]} if test.sources else {}
-            errors = modes.clip_report(model.normalizer, motion, clips[index], self.ik, self.metrics)
+            errors = modes.measure_clip(model.normalizer, motion, clips[index], self.ik, self.metrics)
             rows.append({**facts, "frames": len(clips[index]), **errors})
         branches = [{key: row[key] for key in errors} for row in rows]
         label = {} if model.is_stream else {"offline": True}
-        return {"mean": modes.mean_of_clips(branches), "clips": rows, **label}
+        return {"mean": modes.average_clips(branches), "clips": rows, **label}
 
 
 def predict_first_clip(model: MotionModel, test: MotionDataset) -> tuple[np.ndarray, np.ndarray]:
-    """Return truth and prediction (N, 22, 3) of the first test clip's start, metres, world.
+    """Return true and predicted joints (N, 22, 3) for the first 10 s of the first test clip, metres, world.
 
-    The prediction is made by streaming, if the network can.
+    The mode is "window" for networks that use future frames, and "stream" for all others.
     """
     device = model.normalizer.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)
     motion = modes.MODE_FUNCTIONS["stream" if model.is_stream else "window"](model, [clip])[0]
     predicted = model.normalizer.pose(motion, clip[:, :SPARSE_DIM])
-    truth = modes.joint_positions(clip[:, SPARSE_DIM:])
+    truth = modes.extract_positions(clip[:, SPARSE_DIM:])
     return truth.cpu().numpy(), predicted.cpu().numpy()

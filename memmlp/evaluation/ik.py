@@ -1,6 +1,7 @@
-"""The inverse-kinematics slot: finds local rotations that match the position branch (App. A) or the trackers.
+"""Inverse kinematics: finds local rotations that match the position branch (App. A) or the trackers.
 
-The paper runs L-BFGS for at most 15 iterations from the rotation branch's pose (Table 6, reading 11).
+The paper runs at most 15 iterations of L-BFGS from the rotation branch's pose (Table 6; docs/readings.md,
+no. 11).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Objective = Callable[[Tensor, Tensor], Tensor]
 
 
 class NoIK:
-    """No inverse kinematics: there is no third result beside the two branches."""
+    """No inverse kinematics: only the two branches are evaluated."""
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
         """Return an empty dict."""
@@ -39,17 +40,17 @@ class NoIK:
 class LBFGS:
     """L-BFGS on each frame separately: Table 6's "Rotation + Position Branch".
 
-    The variables are an axis-angle increment for each joint, applied on the right of its predicted rotation:
-    the increment is smooth around the start, and lacks the redundant scale of 6D. The head stays on its
-    tracker as in `Normalizer.pose`, so that the minimised distance is the measured one. A rotation that moves
-    no joint (at the leaves) stays as predicted. Everything is computed in float64, so that a frame's result
-    does not depend on its neighbours.
+    The variables are an axis-angle increment per joint. It multiplies the predicted rotation from the right.
+    Unlike 6D, it does not have a redundant scale. The head stays on its tracker like in `Normalizer.pose`, so
+    the objective is the distance that the metrics measure. Rotations of leaf joints move no joint and keep
+    their predicted values. All computations use float64, so the result of a frame does not depend on the
+    other frames.
 
-    torch.optim.LBFGS is not used, since over a batch it has one step length and one curvature for all frames,
-    so that a frame's result depends on the other frames of the batch.
+    torch.optim.LBFGS is not used. It has one step length and one curvature for a whole batch, so the result
+    of a frame would depend on the other frames.
 
     Attributes:
-        iterations: largest number of iterations.
+        iterations: maximum number of iterations.
         chunk: number of frames that are solved together.
     """
 
@@ -57,10 +58,10 @@ class LBFGS:
     chunk: int = 4096
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
-        """Return the motion (N, 198) with the best-fitting rotations, under the name "combined".
+        """Return {"combined": motion}: the motion (N, 198) with the best-fitting rotations.
 
         Args:
-            normalizer: converts between the world and network space; its rest pose is used.
+            normalizer: provides the rest pose.
             motion: predicted motion (N, 198), world.
             sparse: inputs (N, 54), world.
         """
@@ -69,7 +70,7 @@ class LBFGS:
         return {"combined": torch.cat([rotations, motion[:, POSITION]], -1)}
 
     def solve(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> Tensor:
-        """Return rotations (N, 132) in 6D that bring each frame's joints nearest to the position branch's.
+        """Return 6D rotations (N, 132) that minimise the distance to the joints of the position branch.
 
         A frame with NaN or infinite joints gets NaN rotations.
         """
@@ -78,21 +79,21 @@ class LBFGS:
         target = motion[:, POSITION].double().unflatten(-1, (N_JOINTS, 3)) - head[:, None]
         distance = JointDistance(start, target, normalizer.rest.double())
         increment = minimise(distance, torch.zeros_like(start[..., 0]).flatten(1), self.iterations)
-        solved = matrix_to_sixd(distance.turned(increment)).flatten(1).to(motion.dtype)
+        solved = matrix_to_sixd(distance.apply_increment(increment)).flatten(1).to(motion.dtype)
         return torch.where(target.flatten(1).isfinite().all(1, keepdim=True), solved, torch.nan)
 
 
 class Arms:
-    """The arms alone, in closed form: wrists are brought to their trackers (`memmlp.networks.limb_solver`).
+    """Moves the wrists to their trackers in closed form (`memmlp.networks.limb_solver`).
 
-    It needs no predicted positions, so it works with every network.
+    Only the arms change. Predicted positions are not needed, so it works with every network.
     """
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
-        """Return the motion (N, 198) with arms that reach the trackers, under the name "combined".
+        """Return {"combined": motion}: the motion (N, 198) with arms that reach the trackers.
 
         Args:
-            normalizer: its rest pose is used.
+            normalizer: provides the rest pose.
             motion: predicted motion (N, 198), world.
             sparse: inputs (N, 54), world.
         """
@@ -106,42 +107,44 @@ class Arms:
 IK = NoIK | LBFGS | Arms
 
 
-LEVER = 0.1  # m^2, bounds the unit of a joint whose turn moves little
+LEVER = 0.1  # m^2; limits the units of joints that move other joints little
 
 
 class JointDistance:
-    """The objective: the sum over joints of the squared distance (m^2) to targets relative to the head.
+    """The objective: the sum of squared distances (m^2) between joints and targets.
+
+    Both are relative to the head.
 
     Args:
         start: local rotations (N, 22, 3, 3).
-        target: positions (N, 22, 3) relative to the head, metres.
+        target: target positions (N, 22, 3) relative to the head, metres.
         rest: rest positions (22, 3), metres.
     """
 
     def __init__(self, start: Tensor, target: Tensor, rest: Tensor):
         self.start, self.target, self.rest = start, target, rest
-        self.unit = _units(tuple(rest.flatten().tolist()), rest.dtype, rest.device)
+        self.unit = _compute_units(tuple(rest.flatten().tolist()), rest.dtype, rest.device)
 
     def __call__(self, increment: Tensor, rows: Tensor) -> Tensor:
-        """Return the objective (n,) at increments (n, 66) of the rows (n,) of `start` and `target`."""
-        joints = _joints(self.start[rows], self.turn(increment), self.rest)
+        """Return the objective (n,) at increments (n, 66) for the frames `rows` (n,)."""
+        joints = _compute_joints(self.start[rows], self.scale_increment(increment), self.rest)
         return (joints - self.target[rows]).square().sum((1, 2))
 
-    def turned(self, increment: Tensor) -> Tensor:
+    def apply_increment(self, increment: Tensor) -> Tensor:
         """Return the local rotations (N, 22, 3, 3) after increments (N, 66)."""
-        return self.start @ axis_angle_to_matrix(self.turn(increment))
+        return self.start @ axis_angle_to_matrix(self.scale_increment(increment))
 
-    def turn(self, increment: Tensor) -> Tensor:
+    def scale_increment(self, increment: Tensor) -> Tensor:
         """Convert increments (n, 66) to axis-angle (n, 22, 3), radians."""
         return increment.unflatten(-1, (N_JOINTS, 3)) * self.unit
 
 
-def _joints(start: Tensor, turn: Tensor, rest: Tensor) -> Tensor:
-    """Return the joints' positions (n, 22, 3) relative to the head, metres.
+def _compute_joints(start: Tensor, turn: Tensor, rest: Tensor) -> Tensor:
+    """Return the joint positions (n, 22, 3) relative to the head, metres.
 
     Args:
         start: local rotations (n, 22, 3, 3).
-        turn: axis-angle increments (n, 22, 3), applied on their right.
+        turn: axis-angle increments (n, 22, 3); they multiply `start` from the right.
         rest: rest positions (22, 3), metres.
     """
     local = start @ axis_angle_to_matrix(turn)
@@ -150,25 +153,27 @@ def _joints(start: Tensor, turn: Tensor, rest: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _units(rest: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return each joint's unit of rotation (22, 1) for 66 coordinates of a rest pose; cached per rest pose.
+def _compute_units(rest: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the unit of rotation (22, 1) per joint for a rest pose of 66 coordinates.
 
-    Turning a hip moves more joints than turning a wrist. With these units, the objective's curvature is about
-    the same for each variable, so that few iterations suffice and neighbouring frames get similar solutions.
+    A hip rotation moves more joints than a wrist rotation. With these units, the objective has about the same
+    curvature for each variable. So few iterations are enough, and neighbouring frames get similar solutions.
     """
     still = torch.eye(3, dtype=dtype, device=device).expand(1, N_JOINTS, 3, 3)
     pose = torch.tensor(rest, dtype=dtype, device=device).unflatten(0, (N_JOINTS, 3))
-    moved = jacobian(lambda turn: _joints(still, turn[None], pose)[0].flatten(), torch.zeros_like(pose))
+    moved = jacobian(
+        lambda turn: _compute_joints(still, turn[None], pose)[0].flatten(), torch.zeros_like(pose)
+    )
     return (2 * moved.square().sum(0).mean(-1, keepdim=True) + LEVER).rsqrt()
 
 
 class Curvature(NamedTuple):
-    """The change of the gradient along a step that was taken, from which L-BFGS estimates the curvature.
+    """The changes in one step; L-BFGS estimates the curvature from them.
 
     Attributes:
         x: change of the variables (N, D).
         gradient: change of the gradient (N, D).
-        inverse: 1 / (their inner product) (N,), or 0 for a row whose step is not used.
+        inverse: 1 / (inner product of x and gradient) (N,); 0 for rows that are not used.
     """
 
     x: Tensor
@@ -176,33 +181,33 @@ class Curvature(NamedTuple):
     inverse: Tensor
 
 
-ARMIJO = 1e-4  # the share of the decrease promised by the slope that a step must reach
-HALVINGS = 10  # step lengths tried, each half of the one before
-CURVATURE = 1e-12  # a step's product with the gradient's change must exceed this times the latter's square
+ARMIJO = 1e-4  # the fraction of the linearly predicted decrease that a step must reach
+HALVINGS = 10  # number of step lengths to try; each is half of the previous one
+CURVATURE = 1e-12  # rows with a smaller x @ gradient / gradient**2 (see Curvature) are not used
 
 
 def minimise(objective: Objective, x: Tensor, iterations: int, history: int = 10) -> Tensor:
     """Run L-BFGS (Nocedal and Wright, Algorithm 7.4) on each row of x (N, D) separately.
 
-    Each row has its own curvature and step length (halved from 1 until Armijo's condition holds), and stays
-    unchanged when no step helps: the objective never rises.
+    Each row has its own curvature and step length. The step length starts at 1 and is halved until Armijo's
+    condition holds. If no step satisfies it, the row stays unchanged. So the objective never rises.
 
     Returns:
-        The variables (N, D) at the end.
+        The final variables (N, D).
     """
     everyone = torch.arange(len(x), device=x.device)
-    value, gradient = value_and_gradient(objective, x, everyone)
+    value, gradient = compute_value_and_gradient(objective, x, everyone)
     steps: list[Curvature] = []
     for _ in range(iterations):
-        direction = -two_loop(gradient, steps)
-        after, value = line_search(objective, x, value, gradient, direction)
-        _, new_gradient = value_and_gradient(objective, after, everyone)
-        steps = [*steps, curvature(after - x, new_gradient - gradient)][-history:]
+        direction = -apply_inverse_hessian(gradient, steps)
+        after, value = search_step_length(objective, x, value, gradient, direction)
+        _, new_gradient = compute_value_and_gradient(objective, after, everyone)
+        steps = [*steps, compute_curvature(after - x, new_gradient - gradient)][-history:]
         x, gradient = after, new_gradient
     return x
 
 
-def value_and_gradient(objective: Objective, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+def compute_value_and_gradient(objective: Objective, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the objective (N,) and its gradient (N, D)."""
     with torch.enable_grad():
         x = x.detach().requires_grad_()
@@ -211,30 +216,34 @@ def value_and_gradient(objective: Objective, x: Tensor, rows: Tensor) -> tuple[T
     return value.detach(), gradient
 
 
-def curvature(x: Tensor, gradient: Tensor) -> Curvature:
-    """Return the curvature of a step from its changes (N, D); rows without positive curvature are unused."""
+def compute_curvature(x: Tensor, gradient: Tensor) -> Curvature:
+    """Return the curvature of a step from its changes (N, D).
+
+    Rows without positive curvature are not used.
+    """
     product = (x * gradient).sum(-1)
     useful = product > CURVATURE * gradient.square().sum(-1)
     return Curvature(x, gradient, torch.where(useful, 1 / torch.where(useful, product, 1), 0))
 
 
-def two_loop(gradient: Tensor, steps: list[Curvature]) -> Tensor:
+def apply_inverse_hessian(gradient: Tensor, steps: list[Curvature]) -> Tensor:
     """Return the estimated inverse Hessian times the gradient (N, D), by the two-loop recursion."""
     q, weights = gradient, []
     for step in reversed(steps):
         weight = step.inverse * (step.x * q).sum(-1)
         q = q - weight[:, None] * step.gradient
         weights.append(weight)
-    q = q * first_guess(gradient, steps)[:, None]
+    q = q * estimate_initial_scale(gradient, steps)[:, None]
     for step, weight in zip(steps, reversed(weights), strict=True):
         q = q + (weight - step.inverse * (step.gradient * q).sum(-1))[:, None] * step.x
     return q
 
 
-def first_guess(gradient: Tensor, steps: list[Curvature]) -> Tensor:
-    """Return the first estimate of the inverse Hessian, a multiple (N,) of the identity.
+def estimate_initial_scale(gradient: Tensor, steps: list[Curvature]) -> Tensor:
+    """Return the factors (N,) by which the identity is scaled as the initial inverse Hessian.
 
-    It comes from the row's newest usable step; without such a step, it limits the first step's length to 1.
+    The newest usable step of a row gives its factor. Without such a step, the factor limits the first step to
+    length 1.
     """
     length = 1 / gradient.norm(dim=-1).clamp_min(1)
     for step in steps:
@@ -244,13 +253,14 @@ def first_guess(gradient: Tensor, steps: list[Curvature]) -> Tensor:
     return length
 
 
-def line_search(
+def search_step_length(
     objective: Objective, x: Tensor, value: Tensor, gradient: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Halve each row's step until it is good enough (Armijo's condition).
+    """Halve each row's step until it satisfies Armijo's condition.
 
     Returns:
-        Variables (N, D) and values (N,) after the step; a row for which no step is good enough is unchanged.
+        Variables (N, D) and values (N,) after the step. A row stays unchanged if no step satisfies the
+        condition.
     """
     slope = (gradient * direction).sum(-1)
     rows = (slope < 0).nonzero()[:, 0]

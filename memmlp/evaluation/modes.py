@@ -1,16 +1,21 @@
-"""Evaluation in the two modes of the field, with all clips side by side in one batch.
+"""Evaluation in the two standard modes, with all clips in parallel in one batch.
 
-The mode `stream` is live use: one frame at a time, on the network's own history, with only the last frame of
-each window kept. The mode `window` is AGRoL's: non-overlapping windows, of which all T frames are kept. The
-last call for a clip gets the remaining frames: its window ends with the clip and so overlaps the window
-before, whose earlier estimates are kept.
+The mode `stream` simulates live use. The network gets one frame at a time and uses its own history. Only the
+last frame of each window is kept.
 
-Some networks are evaluated differently in window mode. A network that recalls the window which ended one
-frame before gets each window frame by frame, as in its training: in one call it would get the window of T
-frames ago. Its result for a window is the last call's output. A network without a window is a stream in both
-modes. So is, to rounding, one that predicts each frame from the window that ends with it, as its authors
-evaluate it. A network that predicts the windows of a clip together gets the whole clip
-(`MotionModel.takes_whole_clip`), and can't be a stream.
+The mode `window` follows AGRoL. The windows do not overlap, and all T frames of each window are kept. The
+last window of a clip ends with the clip. So it overlaps the previous window. In the overlap, the estimates of
+the previous window are kept.
+
+Some networks are evaluated differently in window mode:
+
+- A network that recalls the window one frame earlier gets each window frame by frame, like in training. The
+  output of the last call is the result for the window.
+- A network without a window is evaluated like a stream.
+- A network that predicts each frame from the window ending there gives the same results as a stream, up to
+  rounding. Its authors evaluate it in this way.
+- A network that predicts all windows together gets the whole clip (`MotionModel.takes_whole_clip`). It does
+  not support the mode `stream`.
 """
 
 from __future__ import annotations
@@ -31,35 +36,35 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 
 
-def stream(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Predict the world motion (N, 198) of clips (N, 252), frame by frame."""
-    return frame_by_frame(network, clips, 1)
+def predict_stream(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Predict the world motion (N, 198) of clips (N, 252) frame by frame."""
+    return predict_frame_by_frame(network, clips, 1)
 
 
-def window(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Predict the world motion (N, 198) of clips (N, 252), by non-overlapping windows."""
+def predict_windows(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Predict the world motion (N, 198) of clips (N, 252) in non-overlapping windows."""
     if network.windowless:
-        return stream(network, clips)
+        return predict_stream(network, clips)
     if network.takes_whole_clip:
-        return clip_by_clip(network, clips)
+        return predict_clip_by_clip(network, clips)
     if 0 < network.shift < network.frames:
-        return frame_by_frame(network, clips, network.frames)
-    return window_by_window(network, clips)
+        return predict_frame_by_frame(network, clips, network.frames)
+    return predict_window_by_window(network, clips)
 
 
 @torch.no_grad()
-def frame_by_frame(network: MotionModel, clips: Sequence[Tensor], size: int) -> list[Tensor]:
-    """Predict the motion (N, 198) of clips (N, 252) by calls of one new frame each.
+def predict_frame_by_frame(network: MotionModel, clips: Sequence[Tensor], size: int) -> list[Tensor]:
+    """Predict the motion (N, 198) of clips (N, 252). Each network call gets one new frame.
 
-    The motion of each window of `size` frames (or fewer at a clip's end) comes from the call with the
-    window's last frame. With `size` 1, this is a live stream.
+    The last call in each window of `size` frames gives the motion for the whole window. The last window of a
+    clip may be shorter. With `size` 1, this is a live stream.
     """
-    order, lengths, inputs = _side_by_side(clips)
+    order, lengths, inputs = _sort_and_pad(clips)
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
     active = len(clips)
     for t in progress_bar(range(lengths[0]), "stream", unit="frames"):
-        while lengths[active - 1] <= t:  # the clips are sorted by length: the last ones end first
+        while lengths[active - 1] <= t:  # the clips are sorted by length, so the last ones end first
             active -= 1
             state = {name: tensor[:active] for name, tensor in state.items()}
         since = t - t % size
@@ -69,15 +74,15 @@ def frame_by_frame(network: MotionModel, clips: Sequence[Tensor], size: int) -> 
 
 
 @torch.no_grad()
-def window_by_window(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Predict the motion (N, 198) of clips (N, 252) by calls of T new frames, or the rest of a clip."""
+def predict_window_by_window(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Predict the motion (N, 198) of clips (N, 252). Each call gets T new frames, or the remaining ones."""
     size = network.frames
-    order, lengths, inputs = _side_by_side(clips)
+    order, lengths, inputs = _sort_and_pad(clips)
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
     for start in range(0, lengths[0], size):
         remaining = torch.tensor([min(size, length - start) for length in lengths if length > start])
-        for new in remaining.unique().tolist():  # ascending: only full windows go on, and they come last
+        for new in remaining.unique().tolist():  # ascending: only full windows continue, and they come last
             rows = (remaining == new).nonzero()[:, 0].to(inputs.device)
             rows_state = {name: tensor[rows] for name, tensor in state.items()}
             output, after = network.advance(inputs[rows, start : start + new], rows_state)
@@ -87,10 +92,10 @@ def window_by_window(network: MotionModel, clips: Sequence[Tensor]) -> list[Tens
 
 
 @torch.no_grad()
-def clip_by_clip(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Predict the motion (N, 198) of clips (N, 252), by one call for each whole clip."""
+def predict_clip_by_clip(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Predict the motion (N, 198) of clips (N, 252) with one call per clip."""
     inputs = []
-    for clip in clips:  # at least T frames, by repeating the first one
+    for clip in clips:  # repeat the first frame to get at least T frames
         sparse = clip[:, :SPARSE_DIM]
         inputs.append(torch.cat([sparse[:1].expand(max(network.frames - len(clip), 0), -1), sparse]))
     motions = [
@@ -100,65 +105,75 @@ def clip_by_clip(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
 
 
 MODE_FUNCTIONS: dict[str, Callable[[MotionModel, Sequence[Tensor]], list[Tensor]]] = {
-    "window": window,
-    "stream": stream,
+    "window": predict_windows,
+    "stream": predict_stream,
 }
 
 
 def predict(network: MotionModel, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
-    """Predict the motion (N, 198) of each clip (N, 252), with at most `batch` clips side by side."""
+    """Predict the motion (N, 198) of each clip (N, 252), with at most `batch` clips in parallel."""
     groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
     return [motion for group in groups for motion in MODE_FUNCTIONS[mode](network, group)]
 
 
-def clip_report(
+def measure_clip(
     normalizer: Normalizer,
     motion: Tensor,
     truth: Tensor,
     ik: IK | None = None,
     custom: metrics.UserMetrics | None = None,
 ) -> dict[str, dict[str, float]]:
-    """Return the metrics of both branches and of `ik`'s result, from motion (N, 198) and truth (N, 252)."""
+    """Return the metrics of one clip by branch, also for the result of `ik`.
+
+    Args:
+        normalizer: the network's normalizer.
+        motion: predicted motion (N, 198), world.
+        truth: inputs and true motion (N, 252), world.
+        ik: inverse kinematics; None for no additional branch.
+        custom: the custom metrics by name.
+    """
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
-    positions = joint_positions(motion), joint_positions(target)
-    position = metrics.positions_report(*positions) | metrics.custom_report(
+    positions = extract_positions(motion), extract_positions(target)
+    position = metrics.measure_positions(*positions) | metrics.compute_custom_metrics(
         custom or {}, "positions", *positions
     )
-    report = {"rotation": rotations_report(normalizer, motion, truth, custom), "position": position}
+    report = {"rotation": measure_rotation_branch(normalizer, motion, truth, custom), "position": position}
     solved = (ik or NoIK()).solutions(normalizer, motion, sparse)
-    return report | {name: rotations_report(normalizer, one, truth, custom) for name, one in solved.items()}
+    return report | {
+        name: measure_rotation_branch(normalizer, one, truth, custom) for name, one in solved.items()
+    }
 
 
-def rotations_report(
+def measure_rotation_branch(
     normalizer: Normalizer, motion: Tensor, truth: Tensor, custom: metrics.UserMetrics | None = None
 ) -> dict[str, float]:
-    """Return the metrics of the rotations in motion (N, 198) against the truth (N, 252).
+    """Return the metrics of the rotation branch in motion (N, 198) against the truth (N, 252).
 
-    Position metrics are included; these positions follow from the rotations by forward kinematics, with the
+    They include position metrics. Forward kinematics computes these positions from the rotations, with the
     head on its tracker.
     """
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
-    rotations = local_rotations(motion), local_rotations(target)
-    positions = normalizer.pose(motion, sparse), joint_positions(target)
-    report = metrics.rotations_report(*rotations) | metrics.positions_report(*positions)
-    report |= metrics.custom_report(custom or {}, "rotations", *rotations)
-    return report | metrics.custom_report(custom or {}, "positions", *positions)
+    rotations = extract_rotations(motion), extract_rotations(target)
+    positions = normalizer.pose(motion, sparse), extract_positions(target)
+    report = metrics.measure_rotations(*rotations) | metrics.measure_positions(*positions)
+    report |= metrics.compute_custom_metrics(custom or {}, "rotations", *rotations)
+    return report | metrics.compute_custom_metrics(custom or {}, "positions", *positions)
 
 
-def local_rotations(motion: Tensor) -> Tensor:
+def extract_rotations(motion: Tensor) -> Tensor:
     """Return the rotation matrices (N, 22, 3, 3) of motion (N, 198)."""
     return sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
 
 
-def joint_positions(motion: Tensor) -> Tensor:
-    """Return the position branch's joints (N, 22, 3) in motion (N, 198), metres, world."""
+def extract_positions(motion: Tensor) -> Tensor:
+    """Return the joint positions (N, 22, 3) of the position branch from motion (N, 198), metres, world."""
     return motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
 
 
 def cut_clips(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
     """Cut a dataset's clips into pieces of `length` frames.
 
-    Pieces of fewer than `least` frames are left out, unless all pieces are that short.
+    Pieces shorter than `least` frames are dropped, unless all pieces are shorter.
     """
     pieces = [piece for clip in dataset.clips() for piece in clip.split(length)]
     return [p for p in pieces if len(p) >= least] or pieces
@@ -168,34 +183,38 @@ def cut_clips(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
 def measure_stream(
     network: MotionModel, pieces: Sequence[Tensor], custom: metrics.UserMetrics | None = None
 ) -> dict[str, float]:
-    """Return the stream-mode metrics, averaged over pieces of clips, for validation during training."""
-    motions = stream(network, pieces)
+    """Return the stream-mode metrics, averaged over pieces of clips. Validation during training uses them."""
+    motions = predict_stream(network, pieces)
     pairs = zip(motions, pieces, strict=True)
-    mean = mean_of_clips(
-        [clip_report(network.normalizer, motion, piece, custom=custom) for motion, piece in pairs]
+    mean = average_clips(
+        [measure_clip(network.normalizer, motion, piece, custom=custom) for motion, piece in pairs]
     )
     return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
 
 
-def _side_by_side(clips: Sequence[Tensor]) -> tuple[list[int], list[int], Tensor]:
-    """Return the clips' order, the longest first, their lengths in it, and padded inputs (B, N, 54)."""
+def _sort_and_pad(clips: Sequence[Tensor]) -> tuple[list[int], list[int], Tensor]:
+    """Sort clips by length and pad them.
+
+    Returns:
+        The clips' indices, longest clip first; the lengths in this order; the padded inputs (B, N, 54).
+    """
     order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
     inputs = torch.nn.utils.rnn.pad_sequence([clips[i][:, :SPARSE_DIM] for i in order], batch_first=True)
     return order, [len(clips[i]) for i in order], inputs
 
 
-def mean_of_clips(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Return each branch's metrics, mean over clips; clips that are too short for a metric are left out.
+def average_clips(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Return the mean metrics of each branch over clips; clips that are too short for a metric are skipped.
 
-    A clip for which the network returned NaN is not left out: all means of that branch are then NaN.
+    If the network returned NaN for a clip, all means of the branch are NaN.
     """
     return {
-        branch: {name: _mean_of([row[branch] for row in rows], name) for name in values}
+        branch: {name: _average_metric([row[branch] for row in rows], name) for name in values}
         for branch, values in rows[0].items()
     }
 
 
-def _mean_of(rows: Sequence[dict[str, float]], name: str) -> float:
-    if any(math.isnan(row["MPJPE"]) for row in rows):  # it is defined on the shortest clip
+def _average_metric(rows: Sequence[dict[str, float]], name: str) -> float:
+    if any(math.isnan(row["MPJPE"]) for row in rows):  # MPJPE is defined even for the shortest clip
         return math.nan
     return float(torch.tensor([row[name] for row in rows]).nanmean())

@@ -1,4 +1,4 @@
-"""A network in an avatar: three trackers' poses in, a body's pose out.
+"""Live use of a network: three trackers drive a full body.
 
-A stream needs NumPy and ONNX Runtime only; torch is for exporting a full graph and for inverse kinematics.
+A stream needs only NumPy and ONNX Runtime. The export of full graphs and inverse kinematics also need torch.
 """

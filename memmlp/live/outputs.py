@@ -1,22 +1,25 @@
-"""Outputs of a live body: bones by the VMC protocol, trackers for VRChat, both over OSC, and recorded files.
+"""Outputs of a live body: bones for VMC programs, trackers for VRChat, and recorded files.
 
-**VMC** (protocol.vmc.info/english), as VSeeFace, Warudo, EVMC4U and others receive it. Each frame has
-`/VMC/Ext/OK` (version 2.5: loaded, calibrated, normal mode), `/VMC/Ext/T` (seconds since the beginning),
-`/VMC/Ext/Root/Pos` and for each bone `/VMC/Ext/Bone/Pos` (name, position and quaternion xyzw in the parent's
-frame). The frame of reference is Unity's. In the rest pose, a T-pose that faces +Z, all rotations are the
-identity. The root stays at the origin, and all movement is in the hips, since not all programs apply the
-root's.
+**VMC** (protocol.vmc.info/english) is an OSC protocol. VSeeFace, Warudo, EVMC4U and other programs receive
+it. Each frame has these messages:
+- `/VMC/Ext/OK`: loaded, calibrated, normal mode (version 2.5).
+- `/VMC/Ext/T`: seconds since the start.
+- `/VMC/Ext/Root/Pos`: the root, which stays at the origin. The hips contain all movement, because some
+  programs ignore root movement.
+- `/VMC/Ext/Bone/Pos`, for each bone: name, position and quaternion xyzw in the parent's frame.
 
-**VRChat** (docs.vrchat.com/docs/osc-trackers): up to eight trackers and the head,
-`/tracking/trackers/1/position` and so on, three floats each; metres of the real world and Euler angles in
-degrees, applied in the order Z, X, Y, in Unity's frame of reference. VRChat assigns the trackers when the
-wearer calibrates in its T-pose. It shifts all trackers so that the head is at its avatar's head bone, and
-turns them to the head's heading.
+The frame of reference is Unity's. The rest pose is a T-pose that faces +Z, where all rotations are the
+identity.
+
+**VRChat** (docs.vrchat.com/docs/osc-trackers) receives up to eight trackers and the head over OSC. Each has a
+position and a rotation, such as `/tracking/trackers/1/position`. Positions are in metres of the real world.
+Rotations are Euler angles in degrees, in the order Z, X, Y. The frame of reference is Unity's. VRChat assigns
+the trackers when the user calibrates in a T-pose. Then it aligns the head tracker with the avatar's head.
 
 **Recordings**: all files of a recorder contain the same frames. Formats with a skeleton (BVH, glTF) have the
-wearer's height. An npz does not have a body, and its readers use one of the network's size, so it holds the
-motion of the network's body. Missing frames between two poses are interpolated. Breaks, after which the
-network restarted, are left out of the files, and reported.
+user's height. An npz file does not have a skeleton, so it contains the motion of the network's body. Missing
+frames between two poses are interpolated. After a longer break, the network restarts. Breaks are skipped in
+the files, and reported.
 """
 
 from __future__ import annotations
@@ -42,12 +45,12 @@ from memmlp.motion.formats.gltf import UNITY_BONES
 
 VMC_PORT, VRCHAT_PORT = 39539, 9000
 SPACE = SPACES["unity"]
-HALF = 14  # messages of the first datagram; an Ethernet packet holds either half
+HALF = 14  # number of messages in the first datagram; both datagrams fit into an Ethernet packet
 LOADED, CALIBRATED, NORMAL = 1, 3, 0
-LONGEST = 1.0  # seconds without a frame that a recording fills
+LONGEST = 1.0  # maximum number of seconds that a recording interpolates
 FIXED_ROOT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # position and quaternion
-# The joint where a tracker is, and the joint whose bone it turns with: a knee's with the thigh, an elbow's
-# with the upper arm.
+# For each tracker: the joint of its position, and the joint of its rotation. A knee tracker turns with the
+# thigh, and an elbow tracker with the upper arm.
 PLACES = (
     ("pelvis", "pelvis"), ("spine3", "spine3"), ("left_ankle", "left_ankle"), ("right_ankle", "right_ankle"),
     ("left_knee", "left_hip"), ("right_knee", "right_hip"),
@@ -58,27 +61,27 @@ NAMES = (*map(str, range(1, len(PLACES))), "head")
 
 
 class Output(Protocol):
-    """Takes frames without ever waiting: each frame is taken at once, or dropped.
+    """A receiver of frames. It never waits: it processes a frame immediately, or drops it.
 
     Attributes:
-        name: the output's description.
+        name: the description of the output.
     """
 
     name: str
 
     def take(self, frame: BodyFrame) -> None:
-        """Take a frame. Raises OSError if that fails."""
+        """Process a frame. Raises OSError on failure."""
 
     def close(self) -> None:
-        """Complete unfinished work, such as files."""
+        """Finish pending work, such as writing files."""
 
 
 class Outputs:
-    """Several outputs; one that fails is reported once, and tried again with the next frame.
+    """Several outputs. If an output fails, it is reported once, and the next frame is tried again.
 
     Args:
         outputs: the outputs.
-        report: gets a line about each output that fails.
+        report: gets a line about each failing output.
     """
 
     def __init__(self, outputs: Sequence[Output], report: Callable[[str], None]):
@@ -86,17 +89,17 @@ class Outputs:
         self.failed: set[str] = set()
 
     def take(self, frame: BodyFrame) -> None:
-        """Give a frame to all outputs."""
+        """Send a frame to all outputs."""
         for output in self.outputs:
             try:
                 output.take(frame)
             except OSError as error:
                 if output.name not in self.failed:
                     self.failed.add(output.name)
-                    self.report(f"{output.name}: {error.strerror or error}; the others continue")
+                    self.report(f"{output.name}: {error.strerror or error}; other outputs continue")
 
     def close(self) -> None:
-        """Close all outputs, even if closing one of them fails; the first error is raised at the end."""
+        """Close all outputs, then raise the first error."""
         errors = []
         for output in self.outputs:
             try:
@@ -108,7 +111,7 @@ class Outputs:
 
 
 def encode_osc(messages: Iterable[tuple[str, str, Iterable[Any]]]) -> bytes:
-    """Return an OSC bundle of messages: each has an address, a letter of OSC for each argument, and these."""
+    """Return an OSC bundle. Each message has an address, OSC type letters and arguments."""
     from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
     from pythonosc.osc_message_builder import OscMessageBuilder
 
@@ -122,12 +125,12 @@ def encode_osc(messages: Iterable[tuple[str, str, Iterable[Any]]]) -> bytes:
 
 
 class Receiver:
-    """A program that receives datagrams at an address; it need not be running.
+    """The address of a program that receives datagrams. The program does not have to run.
 
     Args:
         host: the program's host name or address.
         port: its UDP port.
-        key: the option by which the user named it.
+        key: the command-line option with the address, for error messages.
 
     Raises:
         InputError: for an unknown host name.
@@ -149,7 +152,7 @@ class Receiver:
     def send(self, datagram: bytes) -> None:
         """Send a datagram, or drop it if the network is busy.
 
-        Raises OSError if the address can't be reached.
+        Raises OSError if the address cannot be reached.
         """
         try:
             self.socket.sendto(datagram, self.address)
@@ -158,12 +161,12 @@ class Receiver:
                 raise
 
     def close(self) -> None:
-        """Release the socket."""
+        """Close the socket."""
         self.socket.close()
 
 
 class VMC:
-    """An output that sends bones by the VMC protocol to a receiver."""
+    """An output that sends bones to a VMC program."""
 
     def __init__(self, receiver: Receiver):
         self.name = f"VMC to {receiver}"
@@ -173,10 +176,12 @@ class VMC:
     def take(self, frame: BodyFrame) -> None:
         """Send the frame's bones, in two datagrams."""
         self.start = frame.time if self.start is None else self.start
-        values = np.empty((N_JOINTS, 7))  # each bone's position, metres, and quaternion in its parent's frame
+        values = np.empty(
+            (N_JOINTS, 7)
+        )  # position (metres) and quaternion of each bone in the parent's frame
         values[:, :3] = (frame.rest - frame.rest[list(PARENTS)]) * SPACE.body
-        values[ROOT, :3] = SPACE.positions_out(frame.positions[ROOT])
-        values[:, 3:] = matrix_to_quaternion(SPACE.pose_out(frame.local))
+        values[ROOT, :3] = SPACE.convert_positions_from_amass(frame.positions[ROOT])
+        values[:, 3:] = matrix_to_quaternion(SPACE.convert_pose_from_amass(frame.local))
         messages: list[tuple[str, str, Iterable[Any]]] = [
             ("/VMC/Ext/OK", "iii", [LOADED, CALIBRATED, NORMAL]),
             ("/VMC/Ext/T", "f", [frame.time - self.start]),
@@ -189,7 +194,7 @@ class VMC:
 
 
 class VRChat:
-    """An output that sends trackers to VRChat at a receiver."""
+    """An output that sends trackers to VRChat."""
 
     def __init__(self, receiver: Receiver):
         self.name = f"VRChat at {receiver}"
@@ -205,54 +210,59 @@ class VRChat:
 
 
 def place_trackers(frame: BodyFrame) -> np.ndarray:
-    """Return position (metres) and Euler angles (degrees) of trackers and head (9, 2, 3), in Unity's axes."""
+    """Return positions (metres) and Euler angles (degrees) of eight trackers and the head.
+
+    The shape is (9, 2, 3), in Unity's axes.
+    """
     turned = np.array(frame.local, np.float64)
     for joint in range(1, N_JOINTS):
         turned[joint] = turned[PARENTS[joint]] @ turned[joint]
-    positions = SPACE.positions_out(frame.positions[AT])
-    return np.stack([positions, euler_degrees(SPACE.rotations_out(turned[TURNS_WITH]))], 1)
+    positions = SPACE.convert_positions_from_amass(frame.positions[AT])
+    return np.stack(
+        [positions, compute_euler_angles(SPACE.convert_rotations_from_amass(turned[TURNS_WITH]))], 1
+    )
 
 
-def euler_degrees(rotations: np.ndarray) -> np.ndarray:
-    """Return Unity's angles (n, 3) about X, Y and Z, degrees, with Ry Rx Rz = rotations (n, 3, 3)."""
+def compute_euler_angles(rotations: np.ndarray) -> np.ndarray:
+    """Return Unity's Euler angles (n, 3) about X, Y and Z, degrees. Ry Rx Rz equals rotations (n, 3, 3)."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # in gimbal lock one of two angles is free
+        warnings.simplefilter("ignore", UserWarning)  # warns about gimbal lock, where one angle is arbitrary
         angles: np.ndarray = Rotation.from_matrix(rotations).as_euler("YXZ", degrees=True)[:, [1, 0, 2]]
     return angles
 
 
 class Recorder:
-    """An output that keeps frames, and writes files of the wearer's motion at the end.
+    """An output that stores frames, and writes files of the user's motion on close.
 
     Args:
-        paths: the files; their suffixes determine the formats.
-        rest: the network's joints in the rest pose (22, 3), metres, SMPL's body frame.
+        paths: the files to write; the suffixes determine the formats.
+        rest: rest joints of the network's body (22, 3), metres, SMPL's body frame.
         fps: the network's frames per second.
-        report: gets a line about each file that was written, and about breaks.
+        report: gets a line about each written file and its breaks.
 
     Raises:
-        InputError: for other suffixes, a file that exists, or a folder that cannot be written.
+        InputError: for an unknown suffix, an existing file, or a folder that cannot be written.
     """
 
     def __init__(self, paths: Sequence[Path], rest: np.ndarray, fps: float, report: Callable[[str], None]):
         for path in paths:
             format_of(path, "--record")
             if path.exists():
-                raise InputError(f"--record {path}: already exists; expected a new file")
+                raise InputError(f"--record {path}: already exists; must be a new file")
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise InputError(f"--record {path}: cannot be written ({error.strerror})") from None
         if len({path.resolve() for path in paths}) < len(paths):
-            raise InputError("--record: the same file twice; expected different files")
+            raise InputError("--record: must not name the same file twice")
         self.name = "recording " + ", ".join(path.name for path in paths)
         self.paths, self.rest, self.fps, self.report = paths, rest, fps, report
-        self.rows: list[np.ndarray] = []  # rotation vectors and the root's position (69,) of each frame
+        self.rows: list[np.ndarray] = []  # per frame: rotation vectors and root position (69,)
         self.filled, self.breaks, self.scale = 0, 0, 1.0
         self.last: tuple[float, np.ndarray, np.ndarray] | None = None
 
     def take(self, frame: BodyFrame) -> None:
-        """Keep a frame, after interpolated frames for those that are missing before it."""
+        """Store a frame. Missing frames before it are interpolated."""
         root = frame.scale * frame.positions[ROOT]  # in the network's body size
         if self.last is not None:
             time, local, last_root = self.last
@@ -273,10 +283,10 @@ class Recorder:
         """Write the files.
 
         Raises:
-            InputError: if a file can't be written; the other files are written all the same.
+            InputError: if a file cannot be written. The other files are still written.
         """
         if not self.rows:
-            self.report("recording: no frame arrived; nothing is written")
+            self.report("recording: no frame was received, so no file is written")
             return
         errors, rows = [], np.stack(self.rows)
         for path in self.paths:
@@ -297,7 +307,7 @@ class Recorder:
         write_motion(path, clip, rest, chosen)
         parts = [f"{path}: {len(clip) / self.fps:.1f} s"]
         if self.breaks:
-            parts.append(f"{self.breaks} break{'s' * (self.breaks > 1)} left out")
+            parts.append(f"{self.breaks} break{'s' * (self.breaks > 1)} skipped")
         if self.filled:
             parts.append(f"{self.filled} of {len(rows)} frames interpolated")
         self.report(", ".join(parts))

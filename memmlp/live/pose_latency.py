@@ -1,4 +1,4 @@
-"""The time of an end-to-end pose on a CPU: from the trackers' sample to joints in the caller's space."""
+"""CPU time of an end-to-end pose: from a sample of the trackers to joints in the caller's space."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import TypeVar
 import numpy as np
 
 from memmlp.common.processes import CoreUsageTimer
-from memmlp.deploy.latency import SETTLING, WARM_UP, InTurn, in_turn
+from memmlp.deploy.latency import SETTLING, WARM_UP, RoundTimes, time_in_rounds
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
 
 Key = TypeVar("Key", bound=Hashable)
-LEAST = 200  # samples that are timed, at least
+LEAST = 200  # minimum number of timed samples
 
 
-def measure_pose(path: Path, steps: int) -> dict[str, float]:
+def measure_pose_times(path: Path, steps: int) -> dict[str, float]:
     """Time end-to-end poses of an exported network on one thread: median and 95th percentile, milliseconds.
 
-    A pose is a call of `Stream.step`: features, conversions, forward kinematics and the network's step.
-    Unlike in `measure_step`, no yardstick runs in between. So a small network stays in the caches, and its
-    pose may take less time than its step does there. `pose_core_share` is the share of that time in which the
-    thread had a core.
+    A pose is one call of `Stream.step`: features, conversions, forward kinematics and the network's step.
+    Unlike `measure_step_times`, this does not run a yardstick between the poses. So a small network stays in
+    the caches, and its pose may be faster than its step in `measure_step_times`. `pose_core_share` is the
+    fraction of the time in which the thread ran on a core.
     """
     stream, clock = Stream(path), CoreUsageTimer()
     seconds = time_poses(stream, WARM_UP + max(steps, LEAST))[WARM_UP:]
@@ -35,17 +35,17 @@ def measure_pose(path: Path, steps: int) -> dict[str, float]:
     }
 
 
-def time_poses_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, InTurn]:
-    """Time end-to-end poses of exported networks on one thread, with all files in turn in each round.
+def time_poses_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, RoundTimes]:
+    """Time end-to-end poses of exported networks on one thread. Each round times all files.
 
-    The first poses of a round are left out.
+    The first poses of a round are not counted.
     """
     streams = {key: Stream(path) for key, path in paths.items()}
-    return in_turn(paths, rounds, lambda key: time_poses(streams[key], SETTLING + steps)[SETTLING:])
+    return time_in_rounds(paths, rounds, lambda key: time_poses(streams[key], SETTLING + steps)[SETTLING:])
 
 
 def time_poses(stream: Stream, count: int) -> np.ndarray:
-    """Return the seconds (count,) of each of the stream's steps, on random trackers."""
+    """Run steps of a stream on random trackers, and return the seconds (count,) of each step."""
     random, seconds = np.random.default_rng(0), np.zeros(count)
     quaternions = random.normal(size=(count, 3, 4))
     rotations = quaternion_to_matrix(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))

@@ -1,6 +1,6 @@
 """Rotations and forward kinematics on NumPy arrays, one frame at a time. Quaternions are x, y, z, w.
 
-`memmlp.motion.geometry` has the same on torch tensors; a live stream does not import torch.
+`memmlp.motion.geometry` has the same functions for torch tensors. A live stream does not import torch.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
 def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
     """Convert matrices (n, 3, 3) to unit quaternions (n, 4), xyzw, w not negative; accurate at every angle.
 
-    Each row of a quaternion's outer product with itself is the quaternion, scaled by one of its components.
-    The row of the largest component is well conditioned.
+    Each row of the quaternion's outer product with itself is the quaternion, scaled by one component. The
+    row of the largest component is well conditioned.
     """
     outer = (matrix.reshape(-1, 9) @ _MATRIX.T + _IDENTITY).reshape(-1, 4, 4)
     pivot = np.einsum("nii->ni", outer).argmax(1)
@@ -43,22 +43,25 @@ def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
     return quaternion
 
 
-def rotate_by_share(matrix: np.ndarray, share: np.ndarray | float) -> np.ndarray:
-    """Return rotations (n, 3, 3) about the same axes by a share, (n,) or one, of the angles (0 to pi)."""
+def rotate_by_fraction(matrix: np.ndarray, fraction: np.ndarray | float) -> np.ndarray:
+    """Return rotations (n, 3, 3) by a fraction of each angle (0 to pi), about the same axes.
+
+    `fraction` is one number or (n,).
+    """
     quaternion = matrix_to_quaternion(matrix)
     vector, w = quaternion[:, :3], quaternion[:, 3]
     sine = np.sqrt(np.einsum("ni,ni->n", vector, vector))
-    half = share * np.arctan2(sine, w)
-    scale = np.where(sine > 1e-9, np.sin(half) / np.maximum(sine, 1e-9), share)
+    half = fraction * np.arctan2(sine, w)
+    scale = np.where(sine > 1e-9, np.sin(half) / np.maximum(sine, 1e-9), fraction)
     return quaternion_to_matrix(np.concatenate([vector * scale[:, None], np.cos(half)[:, None]], 1))
 
 
 def slerp(a: np.ndarray, b: np.ndarray, weight: float) -> np.ndarray:
-    """Interpolate between rotations (n, 3, 3) on the shortest way from a (weight 0) to b (weight 1).
+    """Interpolate between rotations (n, 3, 3) along the shortest path from a (weight 0) to b (weight 1).
 
-    Weights beyond 1 extrapolate.
+    Weights above 1 extrapolate.
     """
-    return a @ rotate_by_share(a.swapaxes(-1, -2) @ b, weight)
+    return a @ rotate_by_fraction(a.swapaxes(-1, -2) @ b, weight)
 
 
 def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
@@ -76,21 +79,22 @@ def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
 
 
 class BodyTree:
-    """Joints, their tree and their rest pose; forward kinematics of one frame.
+    """A body: its joints, their hierarchy and their rest pose. It computes forward kinematics of one frame.
 
-    Every joint's transform is multiplied by that of its ancestor 1, 2, 4, ... joints above. So a tree of
-    depth 8 takes three batched products instead of eight.
+    The computation doubles the chain of transforms in each step. Step k multiplies the transform of each
+    joint by the transform of the ancestor 2^k levels above. So a tree of depth 8 needs three batched products
+    instead of eight.
 
     Args:
-        joints: the joints' names (J).
-        parents: the indices of their parents (J); -1 for the root, which is the first.
-        rest: the joints' positions in the rest pose (J, 3), metres, SMPL's body frame.
+        joints: joint names (J).
+        parents: indices of the parent joints (J); -1 for the root, which is the first joint.
+        rest: joint positions in the rest pose (J, 3), metres, SMPL's body frame.
 
     Attributes:
         tracked: the indices of head, left and right wrist.
         bone_offsets: (J, 3), metres, from the parent to the joint; 0 for the root.
-        ancestors: for 1, 2, 4, ... the index of the ancestor that many levels above each joint (J + 1); the
-            last entry is an extra joint above the root, which stands for the identity.
+        ancestors: an array per step k with the index of the ancestor 2^k levels above each joint (J + 1). The
+            last entry is an extra joint above the root, with the identity transform.
     """
 
     def __init__(self, joints: Sequence[str], parents: Sequence[int], rest: np.ndarray):
@@ -98,7 +102,7 @@ class BodyTree:
         self.tracked = [self.joints.index(name) for name in ("head", "left_wrist", "right_wrist")]
         count = len(self.joints)
         parent = np.array([*parents, -1])
-        parent[parent < 0] = count  # above the root stands the identity, its own parent
+        parent[parent < 0] = count  # the extra joint above the root is its own parent
         self.ancestors = [parent]
         while (self.ancestors[-1] != count).any():
             self.ancestors.append(self.ancestors[-1][self.ancestors[-1]])
@@ -108,11 +112,11 @@ class BodyTree:
         self._transforms = np.tile(np.eye(4, dtype=np.float32), (count + 1, 1, 1))
         self._transforms[:count, :3, 3] = self.bone_offsets
 
-    def positions(self, local: np.ndarray) -> np.ndarray:
-        """Return the positions (J, 3), metres, relative to the head.
+    def compute_positions(self, local: np.ndarray) -> np.ndarray:
+        """Return the joint positions (J, 3), metres, relative to the head.
 
         Args:
-            local: local rotations (J, 3, 3), except for the root's, which is global.
+            local: local rotations (J, 3, 3); the root rotation is global.
         """
         transforms = self._transforms
         transforms[:-1, :3, :3] = local

@@ -1,15 +1,16 @@
-"""Frames of reference by name, with the conversion from each to AMASS' world and back.
+"""Frames of reference by name, with conversions to AMASS' world and back.
 
-| name   | axes of the world                        | body in its T-pose (its rotations are the identity) |
+| name   | axes of the world                        | T-pose, where all rotations are the identity        |
 |--------|------------------------------------------|-----------------------------------------------------|
 | amass  | right-handed, Z up                       | SMPL's frame: Y up, faces +Z, left is +X            |
 | openxr | right-handed, Y up, -Z forward, +X right | upright in the world, faces -Z, left is -X          |
 | unity  | left-handed, Y up, +Z forward, +X right  | upright in the world, faces +Z, left is -X          |
 
-All are in metres. A position (x, y, z) of openxr is (x, -z, y) of amass and (x, y, -z) of unity, so that
-forward is +Y of amass. A global rotation turns the T-pose of the third column into the world. In openxr and
-unity it is the identity for a person who stands upright and looks forward, so that a headset's own pose is
-almost the head's. A local rotation (of a joint relative to its parent) has the T-pose's axes on both sides.
+All positions are in metres. The position (x, y, z) in openxr is (x, -z, y) in amass and (x, y, -z) in unity.
+So the forward direction is +Y in amass. A global rotation turns the T-pose of the third column into the
+world. In openxr and unity, it is the identity for a person who stands upright and looks forward. So the pose
+of a headset is almost the pose of the head. A local rotation is relative to the parent joint, and uses the
+axes of the T-pose.
 """
 
 from __future__ import annotations
@@ -26,48 +27,48 @@ SpaceName = Literal["amass", "openxr", "unity"]
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """A frame of reference. Arrays may have any leading shape.
+    """A frame of reference. Leading dimensions of arrays are arbitrary.
 
     Attributes:
-        name: its name for users.
-        world: orthogonal (3, 3), from its positions to AMASS' world; it includes a mirroring if the space is
+        name: the name in options and arguments.
+        world: orthogonal matrix (3, 3) from this space to AMASS' world. It mirrors if the space is
             left-handed.
-        body: signs (3,), from the axes of its T-pose to SMPL's body frame; they include a mirroring if
-            `world` does.
+        body: signs (3,) from the T-pose axes of this space to SMPL's body frame. They mirror if the space is
+            left-handed.
     """
 
     name: str
     world: np.ndarray
     body: np.ndarray
 
-    def positions_in(self, positions: np.ndarray) -> np.ndarray:
+    def convert_positions_to_amass(self, positions: np.ndarray) -> np.ndarray:
         """Convert positions (..., 3) from this space to AMASS' world."""
         return positions @ self.world.T
 
-    def positions_out(self, positions: np.ndarray) -> np.ndarray:
+    def convert_positions_from_amass(self, positions: np.ndarray) -> np.ndarray:
         """Convert positions (..., 3) from AMASS' world to this space."""
         return positions @ self.world.astype(positions.dtype)
 
-    def rotations_in(self, rotations: np.ndarray) -> np.ndarray:
+    def convert_rotations_to_amass(self, rotations: np.ndarray) -> np.ndarray:
         """Convert global rotations (..., 3, 3) from this space to AMASS' world."""
         return self.world @ rotations * self.body
 
-    def rotations_out(self, rotations: np.ndarray) -> np.ndarray:
+    def convert_rotations_from_amass(self, rotations: np.ndarray) -> np.ndarray:
         """Convert global rotations (..., 3, 3) from AMASS' world to this space."""
         return self.world.T.astype(rotations.dtype) @ rotations * self.body.astype(rotations.dtype)
 
-    def pose_in(self, local: np.ndarray) -> np.ndarray:
-        """Convert local rotations (..., J, 3, 3), the root's global, from this space to AMASS' convention."""
-        return self._posed(local, self.rotations_in(local[..., 0, :, :]))
+    def convert_pose_to_amass(self, local: np.ndarray) -> np.ndarray:
+        """Convert local rotations (..., J, 3, 3) to AMASS' convention; the root rotation is global."""
+        return self._convert_pose(local, self.convert_rotations_to_amass(local[..., 0, :, :]))
 
-    def pose_out(self, local: np.ndarray) -> np.ndarray:
-        """Convert local rotations (..., J, 3, 3), the root's global, from AMASS' convention to this space."""
-        return self._posed(local, self.rotations_out(local[..., 0, :, :]))
+    def convert_pose_from_amass(self, local: np.ndarray) -> np.ndarray:
+        """Convert local rotations (..., J, 3, 3) from AMASS' convention; the root rotation is global."""
+        return self._convert_pose(local, self.convert_rotations_from_amass(local[..., 0, :, :]))
 
-    def _posed(self, local: np.ndarray, root: np.ndarray) -> np.ndarray:
-        """Convert local rotations to the other T-pose's axes, and put `root` in place of the root's rotation.
+    def _convert_pose(self, local: np.ndarray, root: np.ndarray) -> np.ndarray:
+        """Convert local rotations to the axes of the other T-pose, and replace the root rotation by `root`.
 
-        The signs are their own inverse, so this serves both directions.
+        The signs are their own inverse, so one method converts in both directions.
         """
         turned = local * np.outer(self.body, self.body).astype(local.dtype)
         turned[..., 0, :, :] = root
@@ -84,8 +85,8 @@ SPACES = {
 }
 
 
-def space_of(name: str) -> Space:
-    """Return the space with that name. Raises InputError for an unknown name."""
+def find_space(name: str) -> Space:
+    """Return the space with a given name. Raises InputError for an unknown name."""
     if not isinstance(name, str) or name not in SPACES:
         raise InputError(f"space={name}: must be one of {', '.join(SPACES)}")
     return SPACES[name]

@@ -1,4 +1,4 @@
-"""A trained network live: three trackers' poses in, a body's pose out, in the caller's frame of reference."""
+"""Live use of a trained network: poses of three trackers in, body poses out, in the caller's axes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.live.rotations import BodyTree, matrix_to_quaternion, sixd_to_matrix
-from memmlp.live.spaces import SpaceName, space_of
+from memmlp.live.spaces import SpaceName, find_space
 from memmlp.live.tracker_input import OddSamples, TrackerPose, check_time, read_trackers
 from memmlp.live.tracker_resampling import (
     TRACKERS,
     UPRIGHT,
-    Features,
+    FeatureWriter,
     Lost,
     TrackerFrames,
-    heading_of,
-    t_pose,
+    compute_heading,
+    make_t_pose,
 )
 from memmlp.live.wearer import TILTED, Offsets, check_offsets, make_wearer
 from memmlp.motion.body import FEATURES
@@ -32,10 +32,10 @@ from memmlp.runs.run import Run
 if TYPE_CHECKING:
     from memmlp.evaluation.ik import LBFGS
 
-APART = 0.1  # metres between the hands, at least, in a T-pose
-FAR = 0.25  # metres; a device farther from a T-pose's joint is not attached there
-ROUNDED = 5e-4  # metres by which heights may differ, as on a page that shows millimetres
-FORGOTTEN = "the calibration was for another height and is forgotten"
+APART = 0.1  # minimum distance between the hands in a T-pose, metres
+FAR = 0.25  # maximum distance of a device from its joint in a T-pose, metres
+ROUNDED = 5e-4  # metres; heights with a smaller difference are equal, since the page rounds to millimetres
+FORGOTTEN = "the calibration was for another height and was removed"
 NEEDED = ("joints", "parents", "rest", "fps", "T", "branches", "features")
 AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
 
@@ -43,58 +43,58 @@ RotationFormat = Literal["matrix", "quaternion"]
 
 
 class ExportedNetwork(OnnxStream):
-    """An ONNX file of scope `step`, whose steps are those of `OnnxStream`.
+    """An exported network with scope `step`, and its metadata. `OnnxStream` runs the steps.
 
     Attributes:
-        sparse: the input (1, 54), to be written before a step.
-        rotation6d, position: outputs (22, 6) and (22, 3) of the last step, overwritten by the next.
-        body: its joints, their tree and the rest pose.
+        sparse: the input (1, 54). Write it before a step.
+        rotation6d, position: the outputs (22, 6) and (22, 3). The next step overwrites them.
+        body: joints, hierarchy and rest pose.
         fps: frames per second.
         frames: the window's length T.
-        has_position_branch: whether the network predicts positions itself.
+        has_position_branch: whether the network predicts positions.
 
     Raises:
-        InputError: if the file is not such a network, or lacks some of its metadata.
+        InputError: if the file is not an exported network with scope `step`, or its metadata are incomplete.
     """
 
     def __init__(self, path: Path):
         super().__init__(path)
         meta = self.session.get_modelmeta().custom_metadata_map
         if "tracker_positions" in self.inputs:
-            raise InputError(f"{path}: is an ONNX file of scope full; expected one of scope step")
+            raise InputError(f"{path}: has scope full; expected an ONNX file with scope step")
         if "sparse" not in self.inputs or "fps" not in meta:
-            raise InputError(f"{path}: is not a network of memmlp; expected a file that memmlp export writes")
+            raise InputError(f"{path}: is not a memmlp network; expected a file from memmlp export")
         if missing := [key for key in NEEDED if key not in meta]:
-            raise InputError(f"{path}: its metadata lack {', '.join(missing)}; {AGAIN}")
+            raise InputError(f"{path}: metadata are missing: {', '.join(missing)}; {AGAIN}")
         if meta["features"] != FEATURES:
-            raise InputError(f"{path}: its inputs are not those of this version of memmlp; {AGAIN}")
+            raise InputError(f"{path}: has inputs of another memmlp version; {AGAIN}")
         try:
             rest = np.array(json.loads(meta["rest"]), np.float64)
             self.body = BodyTree(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
             self.fps, self.frames = float(meta["fps"]), int(meta["T"])
             self.has_position_branch = "position" in json.loads(meta["branches"])
         except (ValueError, TypeError, LookupError):
-            raise InputError(f"{path}: its metadata are damaged; {AGAIN}") from None
+            raise InputError(f"{path}: has damaged metadata; {AGAIN}") from None
         if not 1 <= self.fps <= 1000:
-            raise InputError(f"{path}: fps={self.fps:g} in its metadata, which are damaged; {AGAIN}")
+            raise InputError(f"{path}: has damaged metadata (fps={self.fps:g}); {AGAIN}")
         self.sparse = self.inputs["sparse"]
         self.rotation6d, self.position = self.outputs["rotation6d"][0], self.outputs["position"][0]
 
 
 class Pose(NamedTuple):
-    """A person's pose at a time, in the caller's frame of reference.
+    """The pose of a person at one time, in the caller's frame of reference.
 
     Attributes:
         time: the frame's time, seconds of the caller's clock.
-        positions: the joints (22, 3), metres, by forward kinematics of the rotations, the head on its
+        positions: joints (22, 3), metres, by forward kinematics of the rotations, with the head on its
             tracker.
-        rotations: local rotations (22, 3, 3), or quaternions xyzw (22, 4); the root's is global.
-        position_branch: the joints (22, 3), metres, from the network's position branch; without one, they
-            follow from its rotations.
-        held: which of "head", "left", "right" are lost at this sample, and held at their last poses.
-        fresh: whether this call made a new frame; if not, the pose is the last frame's.
-        restarted: whether the network restarted at this frame, as it does at the first one, and after
-            `reset` or a gap.
+        rotations: local rotations (22, 3, 3), or quaternions xyzw (22, 4); the root rotation is global.
+        position_branch: joints (22, 3), metres, from the network's position branch. Networks without this
+            branch use forward kinematics.
+        held: the lost trackers of this sample ("head", "left", "right"). They are held at their last poses.
+        fresh: whether this call produced a new frame. If False, the pose is from the previous frame.
+        restarted: whether the network restarted at this frame: at the first frame, and after `reset` or a
+            gap.
     """
 
     time: float
@@ -107,16 +107,16 @@ class Pose(NamedTuple):
 
 
 class BodyFrame(NamedTuple):
-    """The wearer's body at a time, in AMASS' conventions, with the floor at height zero.
+    """The user's body at one time, in AMASS' conventions, with the floor at height zero.
 
     Attributes:
         time: seconds of the trackers' clock.
-        local: rotations (22, 3, 3), relative to the parents, except for the root's, which is global.
-        positions: the joints (22, 3), metres, by forward kinematics of the rotations.
-        position_branch: the joints (22, 3), metres, from the position branch.
-        rest: the joints in the rest pose (22, 3), metres, SMPL's body frame, at the wearer's height.
-        scale: the network's body height divided by the wearer's.
-        held, fresh, restarted: as in `Pose`.
+        local: local rotations (22, 3, 3); the root rotation is global.
+        positions: joints (22, 3), metres, by forward kinematics of the rotations.
+        position_branch: joints (22, 3), metres, from the position branch.
+        rest: rest joints (22, 3), metres, SMPL's body frame, scaled to the user's height.
+        scale: the network's body height divided by the user's.
+        held, fresh, restarted: see `Pose`.
     """
 
     time: float
@@ -137,30 +137,29 @@ ROTATION_FORMATS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 class Stream:
-    """A trained network that is fed live.
+    """A trained network that runs on live trackers.
 
-    A tracker's rotation is that of SMPL's joint (head, wrists): the turn from a T-pose, see
-    `memmlp.live.spaces`. Devices that are attached in other orientations or places differ from the joints by
-    constant offsets, which `calibrate` finds or `offsets` gives. `memmlp.live.tracker_resampling` describes
-    other rates than 60 Hz, lost trackers and gaps.
+    A tracker gives the pose of an SMPL joint (head or wrist). Its rotation is relative to a T-pose; see
+    `memmlp.live.spaces`. Real devices have constant offsets from these joints. `calibrate` measures the
+    offsets, or the argument `offsets` sets them. `memmlp.live.tracker_resampling` describes the handling of
+    other rates than 60 Hz, of lost trackers and of gaps.
 
     Args:
-        source: a finished run or its folder, or an ONNX file that `memmlp export` writes (--scope step).
-        space: the frame of reference of inputs and outputs: amass, openxr or unity.
-        rotations: the format of the output rotations: matrix or quaternion (xyzw).
-        offsets: the offsets of the joints from the devices; None for zero offsets.
-        height: the wearer's body height, metres; None for the height of the network's body.
-        floor: the height of the floor in the space, metres.
+        source: a finished run, its folder, or an ONNX file from `memmlp export --scope step`.
+        space: frame of reference of inputs and outputs: amass, openxr or unity.
+        rotations: format of the output rotations: matrix or quaternion (xyzw).
+        offsets: offsets from the devices to the joints; None for zero offsets.
+        height: the user's body height, metres; None for the height of the network's body.
+        floor: height of the floor in the space, metres.
         ik: inverse kinematics towards the position branch (`memmlp.evaluation.ik.LBFGS()`); needs torch.
 
     Attributes:
-        wearer: height and floor (`memmlp.live.wearer`), as `fit` sets them.
-        step_seconds: the time that the exported step, the network with its features, took in the last
-            `step`: the sum over all frames of the sample.
-        odd: warns, once of each kind, of samples that are hardly metres or seconds (`SampleWarning`).
+        wearer: the user's height and floor (`memmlp.live.wearer`). `fit` changes them.
+        step_seconds: computation time of the network in the last `step`, summed over the sample's frames.
+        odd: warns about implausible units and times (`SampleWarning`), once per kind.
 
     Raises:
-        InputError: if an argument is not one of the above; its message is one line.
+        InputError: if an argument is invalid.
     """
 
     def __init__(
@@ -174,11 +173,11 @@ class Stream:
         floor: float = 0.0,
         ik: LBFGS | None = None,
     ):
-        self.space = space_of(space)
+        self.space = find_space(space)
         if rotations not in ROTATION_FORMATS:
             raise InputError(f"rotations={rotations}: must be one of {', '.join(ROTATION_FORMATS)}")
         if not isinstance(source, Run | str | PathLike) or not str(source):
-            raise InputError(f"source={source!r}: expected a run, its folder, or an ONNX file")
+            raise InputError(f"source={source!r}: must be a run, its folder, or an ONNX file")
         run = source if isinstance(source, Run) else Run(Path(source))
         self.network = ExportedNetwork(run.preferred_onnx if run.folder.is_dir() else run.folder)
         if ik is not None and not self.network.has_position_branch:
@@ -190,23 +189,23 @@ class Stream:
         self.odd = OddSamples()
         self._output = ROTATION_FORMATS[rotations]
         self._trackers = TrackerFrames(self.network.body, self.network.fps)
-        self._features = Features()
-        self._sparse = self.network.sparse[0]  # the network's inputs, in place: written before each step
+        self._features = FeatureWriter()
+        self._sparse = self.network.sparse[0]  # the network's input array; written before each step
         self._last: BodyFrame | None = None
 
     @property
     def rest(self) -> np.ndarray:
-        """The wearer's joints in the rest pose (22, 3), metres, SMPL's body frame."""
+        """The rest joints (22, 3) at the user's height, metres, SMPL's body frame."""
         return self.network.body.rest / self.wearer.scale
 
     def fit(self, height: float | None = None, floor: float = 0.0) -> None:
-        """Set another body height (metres; None for the network's) and floor (metres), and restart.
+        """Set the body height (metres; None for the network's height) and the floor (metres), and restart.
 
-        Offsets for another height are forgotten, with a `SampleWarning`: kept, they would hold the hands some
-        centimetres away. Calibrate again, or set `offsets` after this.
+        A new height removes the offsets and causes a `SampleWarning`, because they would move the hands by
+        some centimetres. Calibrate again, or set `offsets` after this call.
 
         Raises:
-            InputError: if height or floor are out of range.
+            InputError: if height or floor is out of range.
         """
         before = self.wearer.height
         self.wearer = make_wearer(self.network.body, height, floor)
@@ -216,35 +215,34 @@ class Stream:
             self.odd.report(f"offsets: {FORGOTTEN}")
 
     def reset(self) -> None:
-        """Restart: the next sample counts as the first."""
+        """Restart the stream. The next sample counts as the first sample."""
         self._trackers.reset()
         self._restart()
 
     def step(
         self, head: TrackerPose, left: TrackerPose, right: TrackerPose, time: float | None = None
     ) -> Pose:
-        """Take one sample of the trackers.
+        """Process one sample of the trackers.
 
         Args:
             head, left, right: (position (3,) in metres, rotation (4,) xyzw or (3, 3)), or None for a lost
-                tracker. A tracker is also lost with NaN in it, a quaternion of zeros, or a number above 1e6
-                (1,000 km).
-            time: the sample's time, seconds of any clock; None for exactly one frame after the last.
+                tracker. A tracker also counts as lost if it contains NaN or numbers above 1e6, or if its
+                quaternion is zero.
+            time: the sample's time, seconds of any clock; None for one frame after the previous sample.
 
         Returns:
-            The newest frame's pose.
+            The pose of the newest frame.
 
         Raises:
-            InputError: for arrays of other shapes, matrices or quaternions that are not rotations, or a time
-                that is not a number of seconds.
+            InputError: for arrays with another shape, an invalid rotation or an invalid time.
         """
         frame, space = self.step_body(head, left, right, time), self.space
         floor = self.wearer.floor
         return Pose(
             frame.time,
-            space.positions_out(raise_by(frame.positions, floor)),
-            self._output(space.pose_out(frame.local)),
-            space.positions_out(raise_by(frame.position_branch, floor)),
+            space.convert_positions_from_amass(move_up(frame.positions, floor)),
+            self._output(space.convert_pose_from_amass(frame.local)),
+            space.convert_positions_from_amass(move_up(frame.position_branch, floor)),
             frame.held,
             frame.fresh,
             frame.restarted,
@@ -253,17 +251,19 @@ class Stream:
     def step_body(
         self, head: TrackerPose, left: TrackerPose, right: TrackerPose, time: float | None = None
     ) -> BodyFrame:
-        """Take one sample as `step` does, and return the newest frame in AMASS' conventions."""
+        """Process one sample like `step`, and return the newest frame in AMASS' conventions."""
         check_time(time)
         positions, rotations, lost = read_trackers((head, left, right))
         if self.offsets is not None:
             positions = positions + (rotations @ self.offsets.positions[:, :, None])[..., 0]
             rotations = rotations @ self.offsets.rotations
         self.step_seconds = 0.0
-        held = _names(lost)
-        world = self.wearer.positions_in(self.space.positions_in(positions))
+        held = _list_lost(lost)
+        world = self.wearer.scale_to_network(self.space.convert_positions_to_amass(positions))
         self.odd.take(time, world, lost)
-        frames, restarted = self._trackers.take(time, world, self.space.rotations_in(rotations), lost)
+        frames, restarted = self._trackers.take(
+            time, world, self.space.convert_rotations_to_amass(rotations), lost
+        )
         if not frames:
             assert self._last is not None  # the first sample always makes a frame
             return self._last._replace(held=held, fresh=False, restarted=False)
@@ -273,7 +273,7 @@ class Stream:
             first = self._features.last is None
             self._features.write(frame, self._sparse)
             began = perf_counter()
-            if first:  # it has no velocity, so it is shown but kept out of the past, as in training
+            if first:  # without velocities, it gives a pose but does not change the state, like in training
                 self.network.peek()
             else:
                 self.network.advance()
@@ -282,7 +282,7 @@ class Stream:
         self._last = BodyFrame(
             frames[-1].time,
             local,
-            (self.network.body.positions(local) + frames[-1].positions[0]) / scale,
+            (self.network.body.compute_positions(local) + frames[-1].positions[0]) / scale,
             self.network.position / scale,
             self.rest,
             scale,
@@ -293,7 +293,7 @@ class Stream:
         return self._last
 
     def _rotations(self) -> np.ndarray:
-        """Return the last step's rotations (22, 6), after inverse kinematics if there is any."""
+        """Return the rotations (22, 6) of the last step, after inverse kinematics if `ik` is set."""
         sixd: np.ndarray = self.network.rotation6d
         if self.ik is None:
             return sixd
@@ -310,56 +310,58 @@ class Stream:
         return np.asarray(solved).reshape(-1, 6)
 
     def calibrate(self, head: TrackerPose, left: TrackerPose, right: TrackerPose) -> Offsets:
-        """Learn the offsets from a person who stands upright in T-pose, and use them from now on.
+        """Measure the offsets of a person who stands upright in a T-pose, and use them in this stream.
 
-        The line from the right to the left tracker gives the person's heading, and thereby every joint's
-        rotation. The joints' positions are those of the network's body in that pose, at the wearer's height,
-        placed as near to the devices as possible (least squares). So a person with other proportions moves a
-        body with the network's proportions. A head's device far from upright is accepted, with a
-        `SampleWarning`: it may be mounted so, but quaternions of another order look like that, too.
+        The line from the right to the left tracker gives the person's heading, and so the rotation of each
+        joint. The joint positions come from the network's body in this pose, scaled to the user's height.
+        They are fitted to the devices by least squares. So a person with other proportions moves a body with
+        the network's proportions. If the head's device is far from upright, there is a `SampleWarning`.
+        Either the device is mounted with this tilt, or the quaternions are not xyzw.
 
         Args:
-            head, left, right: the devices' poses, as in `step`.
+            head, left, right: the poses of the devices, see `step`.
 
         Returns:
-            The offsets, which can be passed to later streams.
+            The offsets. They can be passed to later streams.
 
         Raises:
-            InputError: for a lost tracker, hands that are not apart, a head that looks backwards with respect
-                to the hands, or a device that is more than 25 cm from its joint in a T-pose. The offsets stay
-                unchanged then.
+            InputError: for a lost tracker, hands close together, a head that looks backwards relative to the
+                hands, or a device more than 25 cm from its joint in a T-pose. The stream keeps its old
+                offsets.
         """
         positions, rotations, lost = read_trackers((head, left, right))
         if any(lost):
-            raise InputError(f"calibrate: lost {', '.join(_names(lost))}; all three trackers are needed")
-        world = self.wearer.positions_in(self.space.positions_in(positions))
+            raise InputError(f"calibrate: needs all three trackers; lost: {', '.join(_list_lost(lost))}")
+        world = self.wearer.scale_to_network(self.space.convert_positions_to_amass(positions))
         across = world[1] - world[2]
         if np.hypot(*across[:2]) < APART:
-            raise InputError("calibrate: the hands are not apart; stand in T-pose, the arms to the sides")
-        heading = float(np.arctan2(across[1], across[0]))
-        device = self.space.rotations_in(rotations)[0]
-        upright = (device @ UPRIGHT.T)[2, 2] > np.cos(TILTED)
-        if upright and np.cos(heading_of(device) - heading) < 0:
             raise InputError(
-                "calibrate: the head looks backwards as seen from the hands; are left and right exchanged, "
-                "or is the head's device mounted backwards?"
+                "calibrate: the hands are not apart; stand in a T-pose with the arms to the sides"
             )
-        pose = t_pose(self.network.body, world[0], heading)
+        heading = float(np.arctan2(across[1], across[0]))
+        device = self.space.convert_rotations_to_amass(rotations)[0]
+        upright = (device @ UPRIGHT.T)[2, 2] > np.cos(TILTED)
+        if upright and np.cos(compute_heading(device) - heading) < 0:
+            raise InputError(
+                "calibrate: the head looks backwards relative to the hands; check that left and right are "
+                "not exchanged, and that the head's device is not mounted backwards"
+            )
+        pose = make_t_pose(self.network.body, world[0], heading)
         joints = pose.positions + (world - pose.positions).mean(0)
         inverse = rotations.swapaxes(1, 2)
-        worn = raise_by(joints / self.wearer.scale, self.wearer.floor)
-        away = self.space.positions_out(worn) - positions
-        turned = inverse @ self.space.rotations_out(pose.rotations)
+        target = move_up(joints / self.wearer.scale, self.wearer.floor)
+        away = self.space.convert_positions_from_amass(target) - positions
+        turned = inverse @ self.space.convert_rotations_from_amass(pose.rotations)
         offsets = Offsets((inverse @ away[:, :, None])[..., 0], turned)
         worst = int(offsets.distances.argmax())
         if offsets.distances[worst] > FAR:
             raise InputError(
                 f"calibrate: {TRACKERS[worst]} is {100 * offsets.distances[worst]:.0f} cm from its joint in "
-                f"a T-pose; must be at most {100 * FAR:.0f}: stand upright, arms straight to the sides, "
-                "and give the body height; positions are in metres"
+                f"a T-pose; must be at most {100 * FAR:.0f} cm. Stand upright with straight arms to the "
+                "sides, and check the body height and that positions are in metres"
             )
-        if offsets.doubt:
-            self.odd.report(f"calibrate: {offsets.doubt}")
+        if offsets.tilt_warning:
+            self.odd.report(f"calibrate: {offsets.tilt_warning}")
         self.offsets = offsets
         self.reset()
         return offsets
@@ -370,11 +372,11 @@ class Stream:
         self._last = None
 
 
-def raise_by(positions: np.ndarray, height: float) -> np.ndarray:
-    """Return positions (..., 3), metres, Z up, moved up by a height."""
+def move_up(positions: np.ndarray, height: float) -> np.ndarray:
+    """Return positions (..., 3), metres, Z up, moved up by `height`."""
     raised: np.ndarray = positions + np.array([0.0, 0.0, height], positions.dtype)
     return raised
 
 
-def _names(lost: Lost) -> tuple[str, ...]:
+def _list_lost(lost: Lost) -> tuple[str, ...]:
     return tuple(name for name, gone in zip(TRACKERS, lost, strict=True) if gone)

@@ -1,4 +1,4 @@
-"""Checks of a stream's samples: malformed trackers are rejected, and odd units or clocks give a warning."""
+"""Checks of a stream's samples: malformed trackers are rejected, and implausible values cause a warning."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.tracker_resampling import GAP, TRACKERS, Lost
 from memmlp.live.wearer import check_rotations
 
-FARTHEST = 1e6  # metres; a tracker farther from the origin is taken as lost
-LATEST = 1e10  # seconds; at much later times floats can't tell frames of 1/60 s apart
+FARTHEST = 1e6  # metres; a tracker farther from the origin counts as lost
+LATEST = 1e10  # seconds; floats of much later times cannot resolve frames of 1/60 s
 UNIT = 1e-2  # how far a quaternion's norm may be from 1
 NEUTRAL = np.concatenate([np.zeros(3), np.eye(3).reshape(9)])
 
-JUMPS, STILL = 5, 30  # samples in a row
-COARSE = 1e-3  # seconds between neighbouring times
-REACH = 5.0  # metres from head to hand; a hand in front of the face is as far in centimetres
-HIGHEST = 3.0  # metres of a head above the floor
+JUMPS, STILL = 5, 30  # number of consecutive samples
+COARSE = 1e-3  # seconds; times with a coarser resolution are odd
+REACH = 5.0  # metres from head to hand; positions in centimetres are farther apart
+HIGHEST = 3.0  # metres; maximum height of the head above the floor
 
 TrackerPose = tuple[ArrayLike, ArrayLike] | None
 
 
 class SampleWarning(UserWarning):
-    """A stream's samples can hardly be what it expects: metres, seconds, quaternions xyzw."""
+    """Samples of a stream are probably not in metres, seconds or quaternions xyzw."""
 
 
 def read_trackers(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray, Lost]:
-    """Return positions (3, 3), rotations (3, 3, 3) and which trackers are lost, from a user's trackers.
+    """Convert a user's trackers to positions (3, 3), rotations (3, 3, 3) and lost flags.
 
-    A lost tracker has the identity in place of its pose. Raises InputError if a tracker is malformed.
+    A lost tracker gets the identity as its pose. Raises InputError if a tracker is malformed.
     """
     poses, quaternions = np.full((3, 12), np.nan), {}
     for index, (name, tracker) in enumerate(zip(TRACKERS, trackers, strict=True)):
@@ -44,11 +44,13 @@ def read_trackers(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarr
         try:
             position, rotation = (np.asarray(part, np.float64) for part in tracker)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name}: expected (position, rotation), arrays of numbers, or None") from error
+            raise InputError(
+                f"{name}: expected (position, rotation) as arrays of numbers, or None"
+            ) from error
         if position.shape != (3,):
-            raise InputError(f"{name}: a position of shape {position.shape}; expected (3,), metres")
+            raise InputError(f"{name}: position has shape {position.shape}; must be (3,), metres")
         if rotation.shape not in ((4,), (3, 3)):
-            raise InputError(f"{name}: a rotation of shape {rotation.shape}; expected (4,) xyzw or (3, 3)")
+            raise InputError(f"{name}: rotation has shape {rotation.shape}; must be (4,) xyzw or (3, 3)")
         poses[index, :3] = position
         if rotation.shape == (4,):
             quaternions[index] = rotation
@@ -67,19 +69,20 @@ def read_trackers(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarr
 def _to_matrices(quaternions: dict[int, np.ndarray]) -> np.ndarray:
     """Convert trackers' quaternions (4,), xyzw, to matrices (n, 3, 3).
 
-    Zeros, which runtimes give for a lost tracker, become NaN. Raises InputError for another norm than 1.
+    Quaternions of zeros become NaN, because runtimes return them for lost trackers. Raises InputError if a
+    norm is not 1.
     """
     array = np.array(list(quaternions.values()))
     norms = np.sqrt(np.einsum("ni,ni->n", array, array))
     for index, norm in zip(quaternions, norms.tolist(), strict=True):
         if abs(norm - 1) > UNIT and norm != 0 and math.isfinite(norm):
-            raise InputError(f"{TRACKERS[index]}: a quaternion of norm {norm:.3g}; its norm must be 1 (xyzw)")
+            raise InputError(f"{TRACKERS[index]}: quaternion has norm {norm:.3g}; must be 1 (xyzw)")
     norms[norms == 0] = np.nan
     return quaternion_to_matrix(array / norms[:, None])
 
 
 def check_time(time: float | None) -> None:
-    """Raise InputError for anything but a time in seconds or None."""
+    """Raise InputError unless `time` is a time in seconds or None."""
     if time is None:
         return
     if not isinstance(time, (int, float, np.integer, np.floating)) or not abs(time) <= LATEST:
@@ -91,25 +94,28 @@ def check_time(time: float | None) -> None:
 ODD = {
     "jump": (
         JUMPS,
-        f"are over {GAP:g} s apart by their times, and the network restarts with each; is `time` in seconds?",
+        f"have times over {GAP:g} s apart, and each restarts the network; check that `time` is in seconds",
     ),
-    "still": (STILL, "are no later than the ones before them, and make no frame; does `time` stand still?"),
+    "still": (
+        STILL,
+        "have times that do not increase, and give no frames; check that `time` does not stand still",
+    ),
     "coarse": (
         STILL,
-        "have times of single precision, which is milliseconds so late, so that velocities are wrong; send "
-        "`time` in double precision (OSC's d), or count from the start",
+        "have times in single precision, which are too coarse for velocities; send `time` in double "
+        "precision (OSC's d), or count from the start",
     ),
-    "far": (JUMPS, f"have a hand over {REACH:g} m from the head; are positions in metres?"),
+    "far": (JUMPS, f"have a hand over {REACH:g} m from the head; check that positions are in metres"),
     "high": (
         STILL,
-        f"have the head over {HIGHEST:g} m above the floor; are positions in metres, and is `floor` right?",
+        f"have the head over {HIGHEST:g} m above the floor; check `floor`, and that positions are in metres",
     ),
 }
-"""Kinds of odd samples: the number of odd samples in a row that triggers the warning, and its line."""
+"""Kinds of odd samples: the number of consecutive samples that triggers each warning, and its text."""
 
 
 def warn_caller(line: str) -> None:
-    """Warn the caller of this package."""
+    """Issue a SampleWarning that shows the first line of code outside of memmlp.live."""
     frame, level = sys._getframe(), 1
     while frame.f_back and str(frame.f_globals.get("__name__")).startswith("memmlp.live."):
         frame, level = frame.f_back, level + 1
@@ -117,14 +123,15 @@ def warn_caller(line: str) -> None:
 
 
 class OddSamples:
-    """Detects odd samples of a stream, and warns once of each kind.
+    """Detects odd samples of a stream, and warns once per kind.
 
-    Times in milliseconds jump at every sample, and each jump restarts the network. While a clock stands
-    still, no frame is made. One in single precision, such as OSC's `f`, is coarse after some hours, and the
-    velocities of the trackers are wrong then. Positions in other units than metres are far apart, and high.
+    - Times in milliseconds jump at every sample. Each jump restarts the network.
+    - A clock that stands still gives no frames.
+    - Times in single precision, such as OSC's `f`, are coarse after some hours. Then velocities are wrong.
+    - Positions in other units than metres are far apart or high.
 
     Args:
-        report: gets a line at the first detection of each kind; by default it becomes a `SampleWarning`.
+        report: gets a line at the first detection of each kind. By default, it issues a `SampleWarning`.
     """
 
     def __init__(self, report: Callable[[str], None] = warn_caller):
@@ -134,17 +141,17 @@ class OddSamples:
 
     @property
     def jumping(self) -> bool:
-        """Whether the times of so many successive samples jumped that no pause explains it."""
+        """Whether the times of at least five consecutive samples jumped, which a pause cannot explain."""
         return self.row["jump"] >= JUMPS
 
     def take(self, time: float | None, positions: np.ndarray, lost: Lost) -> None:
-        """Take a sample.
+        """Check a sample.
 
         Args:
             time: seconds; None for a sample without a time.
-            positions: of head, left and right (3, 3), metres of the network's body, above its floor, AMASS'
-                axes.
-            lost: which of them are lost.
+            positions: positions of head, left and right (3, 3), scaled to the network's body and floor,
+                metres, AMASS' axes.
+            lost: the lost flags of the trackers.
         """
         odd_kinds: dict[str, bool] = {}
         if not lost[0]:
@@ -166,4 +173,4 @@ class OddSamples:
             least, line = ODD[kind]
             if self.row[kind] == least and kind not in self.reported:
                 self.reported.add(kind)
-                self.report(f"{least} samples in a row {line}")
+                self.report(f"{least} consecutive samples {line}")

@@ -1,16 +1,21 @@
-"""The whole way from trackers to a body as one ONNX file, for programs without Python (`--scope full`);
-`memmlp.live.stream` is that way in Python.
+"""All computations from trackers to a body as one ONNX file, for programs without Python (`--scope full`).
 
-Inputs are one frame at 60 Hz: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3),
-matrices, of head, left and right wrist; and the states `state.*`, all zeros for a fresh start.
+`memmlp.live.stream` does the same in Python.
 
-Outputs are `rotations` (1, 22, 3, 3), local matrices, or, on request, (1, 22, 4), unit quaternions x, y, z, w
-whose w is not negative; the root's are global. `positions` (1, 22, 3), metres, by forward kinematics with the
-head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new states, under the
-same names with the suffix `.next`.
+Inputs, one frame at 60 Hz:
+- `tracker_positions` (1, 3, 3): head, left and right wrist, metres.
+- `tracker_rotations` (1, 3, 3, 3): matrices of the same joints.
+- `state.*`: the states; all zeros at the start.
 
-All inputs and outputs are in the chosen frame of reference (memmlp.live.spaces). Lost trackers, other rates
-and gaps (memmlp.live.tracker_resampling) are left to the caller: NaN in is NaN out.
+Outputs:
+- `rotations` (1, 22, 3, 3): local matrices; the root rotation is global. With `rotations=quaternion`, they
+  are unit quaternions xyzw (1, 22, 4) with w >= 0.
+- `positions` (1, 22, 3): metres, by forward kinematics with the head on its tracker.
+- `joints` (1, 22, 3): metres, the positions that the network predicts.
+- `state.*.next`: the new states.
+
+All inputs and outputs are in the chosen frame of reference (memmlp.live.spaces). The caller must handle lost
+trackers, other rates and gaps (see memmlp.live.tracker_resampling). NaN inputs give NaN outputs.
 """
 
 from __future__ import annotations
@@ -23,12 +28,12 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.export import metadata, save
+from memmlp.deploy.export import export_module, make_metadata
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import stream_torch
 from memmlp.live.rotations import BodyTree, quaternion_to_matrix
-from memmlp.live.spaces import Space, space_of
+from memmlp.live.spaces import Space, find_space
 from memmlp.motion.body import (
     HEAD,
     JOINTS,
@@ -49,14 +54,14 @@ INPUTS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")
 UNIT = 1e-4  # how far a quaternion's norm may be from 1
 OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
-"""States besides the network's: whether there was an earlier frame, and its trackers in AMASS' world."""
+"""Additional states: whether there was an earlier frame, and the trackers of that frame in AMASS' world."""
 
 
-def quaternions(rotations: Tensor) -> Tensor:
+def convert_to_quaternions(rotations: Tensor) -> Tensor:
     """Convert matrices (..., 3, 3) to unit quaternions (..., 4), xyzw, w not negative; accurate everywhere.
 
-    This computes the same as `memmlp.motion.geometry.matrix_to_wxyz`, but finds the well-conditioned one of
-    the four forms by comparing two at a time, which needs no computed index.
+    The results equal `memmlp.motion.geometry.matrix_to_wxyz`. This function selects the best-conditioned of
+    four formulas by pairwise comparisons, which do not need a computed index.
     """
     m = rotations.flatten(-2).split(1, -1)
     xx, yy, zz = m[0], m[4], m[8]
@@ -75,18 +80,18 @@ def quaternions(rotations: Tensor) -> Tensor:
 
 FORMATS: dict[str, Callable[[Tensor], Tensor]] = {
     "matrix": lambda matrices: matrices,
-    "quaternion": quaternions,
+    "quaternion": convert_to_quaternions,
 }
 """The formats of output rotations, by name."""
 
 
 class FullStep(nn.Module):
-    """One frame, from trackers to joints, with flat inputs and outputs.
+    """The step of one frame from trackers to joints, with flat inputs and outputs.
 
     Args:
-        model: the network, as it was trained or as its streaming graph.
+        model: the trained network or its streaming graph.
         space: the frame of reference of inputs and outputs.
-        output: converts rotation matrices to the format of the outputs; one of FORMATS.
+        output: converts rotation matrices to the output format; a value of FORMATS.
     """
 
     world: Tensor
@@ -104,12 +109,12 @@ class FullStep(nn.Module):
         self.register_buffer("bones", torch.tensor(tree.bone_offsets, dtype=torch.float32)[None, ..., None])
 
     def initial_state(self) -> dict[str, Tensor]:
-        """Return the states of a fresh start, which are zeros."""
+        """Return the initial states, all zeros."""
         own = {f"trackers.{name}": torch.zeros(shape) for name, shape in OWN.items()}
         return own | self.model.initial_state(1)
 
     def forward(self, positions: Tensor, rotations: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Return the outputs and the new states that the module's docstring lists, in that order."""
+        """Return the outputs and the new states in the order of the module docstring."""
         seen, last_positions, last_rotations = state[: len(OWN)]
         positions = positions @ self.world.T
         rotations = self.world @ rotations * self.body
@@ -120,12 +125,13 @@ class FullStep(nn.Module):
         )
         before = dict(zip(self.names, state[len(OWN) :], strict=True))
         motion, after = self.model.advance(sparse[:, None], before, 1)
-        # A first frame has no velocity: it is shown, but is not part of the network's past, as in training.
+        # The first frame does not have velocities. It gives a pose, but does not change the network's state,
+        # like in training.
         kept = [after[name] * seen.view(-1, *[1] * (after[name].ndim - 1)) for name in self.names]
-        pose = self.convert_out(motion[:, -1], positions[:, 0])
+        pose = self.convert_outputs(motion[:, -1], positions[:, 0])
         return *pose, seen.clamp_min(1), positions, rotations, *kept
 
-    def convert_out(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def convert_outputs(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rotations, positions and joints in the graph's frame of reference.
 
         Args:
@@ -133,8 +139,8 @@ class FullStep(nn.Module):
             head: the head tracker's position (1, 3), metres, AMASS' world.
         """
         local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
-        # Forward kinematics by the products of `BodyTree.positions`: few operations on large arrays, which
-        # run faster in a graph than many small ones.
+        # Forward kinematics like in `BodyTree.compute_positions`: a graph runs few operations on large arrays
+        # faster than many small operations.
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(1, N_JOINTS, 1, 4)
         transforms = torch.cat([torch.cat([local, self.bones], -1), bottom], -2)
         transforms = torch.cat([transforms, torch.eye(4).expand(1, 1, 4, 4)], 1)
@@ -156,32 +162,31 @@ def export_full(
     rotations: str = "matrix",
     opset: int = NATIVE,
 ) -> None:
-    """Write the whole step, on the CPU in float32, as one ONNX file with its metadata.
+    """Write the full step and its metadata as one ONNX file for the CPU in float32.
 
     Raises:
-        InputError: for an unknown space or format of rotations, or an opset to which the step can't be
-            converted.
+        InputError: for an unknown space or rotation format, or an opset that does not support the step.
     """
     if rotations not in FORMATS:
         raise InputError(f"rotations={rotations}: must be one of {', '.join(FORMATS)}")
-    step = FullStep(model.cpu().eval(), space_of(space), FORMATS[rotations]).eval()
+    step = FullStep(model.cpu().eval(), find_space(space), FORMATS[rotations]).eval()
     state = step.initial_state()
     names = [f"state.{name}" for name in state]
-    save(
+    export_module(
         step,
         (torch.zeros(1, 3, 3), torch.eye(3).expand(1, 3, 3, 3), *state.values()),
         [*INPUTS, *names],
         [*OUTPUTS, *(f"{name}.next" for name in names)],
         path,
-        metadata(model, run_id) | {"scope": "full", "space": space, "rotations": rotations},
+        make_metadata(model, run_id) | {"scope": "full", "space": space, "rotations": rotations},
         opset,
     )
 
 
-def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the trackers of frames (N, 252 or 54): positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3).
+def extract_trackers(frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Return tracker positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3) of frames (N, 252 or 54).
 
-    The first entry is the time step before the first frame, reconstructed from that frame's velocities.
+    The first entry is the time step before the first frame. The velocities of the first frame give its poses.
     """
     sixd = frames[:, SPARSE_ROTATION].unflatten(-1, (3, 6))
     turned = sixd_to_matrix(frames[:1, SPARSE_ANGULAR_VELOCITY].unflatten(-1, (3, 6)))
@@ -191,22 +196,30 @@ def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([positions[:1] - velocity, positions]), torch.cat([before, rotations])
 
 
-def full_differences(model: MotionModel, path: Path, clip: Tensor, space: str = "amass") -> Tensor:
-    """Return each frame's largest difference (N,) between torch and the file over a clip (N, 252).
+def measure_full_differences(model: MotionModel, path: Path, clip: Tensor, space: str = "amass") -> Tensor:
+    """Return each frame's largest difference (N,) between torch and an ONNX file over a clip (N, 252).
 
-    Each of them has its own history. Torch computes what evaluation does: the features of the same trackers,
-    the network, and `Normalizer.pose`. Quaternions are converted to matrices for the comparison; others than
-    unit quaternions differ by infinity.
+    torch and the file each use their own history. torch computes the same as evaluation: features, network
+    and `Normalizer.pose`. Quaternions are converted to matrices first. If a quaternion does not have length
+    1, all differences are infinity.
     """
-    positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
-    sparse, reference, stream = sparse_features(rotations, positions), space_of(space), OnnxStream(path)
+    positions, rotations = extract_trackers(clip[:, :SPARSE_DIM].cpu())
+    sparse, reference, stream = sparse_features(rotations, positions), find_space(space), OnnxStream(path)
     motion = stream_torch(model.cpu().eval(), sparse)
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
     joints = [model.normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
-    expected = [reference.pose_out(local), *(reference.positions_out(part.numpy()) for part in joints)]
-    inputs = reference.positions_out(positions.numpy()), reference.rotations_out(rotations.numpy())
+    expected = [
+        reference.convert_pose_from_amass(local),
+        *(reference.convert_positions_from_amass(part.numpy()) for part in joints),
+    ]
+    inputs = (
+        reference.convert_positions_from_amass(positions.numpy()),
+        reference.convert_rotations_from_amass(rotations.numpy()),
+    )
     steps = [stream.step(*(part[index : index + 1] for part in inputs)) for index in range(len(clip) + 1)]
-    found = [np.concatenate(parts)[1:] for parts in zip(*steps, strict=True)]  # they begin a step earlier
+    found = [
+        np.concatenate(parts)[1:] for parts in zip(*steps, strict=True)
+    ]  # drop the step before the first frame
     if found[0].shape[-1] == 4:
         if not np.abs(np.linalg.norm(found[0], axis=-1) - 1).max() <= UNIT:
             return torch.full((len(clip),), torch.inf)

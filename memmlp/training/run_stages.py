@@ -24,7 +24,7 @@ from memmlp.common.progress import announce, notify
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation, predict_first_clip
 from memmlp.evaluation.predictions import save_predictions
-from memmlp.live.pose_latency import measure_pose
+from memmlp.live.pose_latency import measure_pose_times
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.architectures import Architecture
@@ -328,9 +328,9 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
         deployed = run.deployment(name)
         deployed.latency.unlink(missing_ok=True)  # an incomplete deployment is made again from the start
         record = deployment.deploy(model, deployed, run.id, *clips)
-        record |= measure_pose(deployed.onnx, deployment.latency_steps)
+        record |= measure_pose_times(deployed.onnx, deployment.latency_steps)
         if (precision := deployment.precision) in record:
-            record[precision] |= measure_pose(deployed.onnx_path(precision), deployment.latency_steps)
+            record[precision] |= measure_pose_times(deployed.onnx_path(precision), deployment.latency_steps)
         settings = select_deployment_settings(experiment.config)
         deployed.finish({"run": run.manifest["id"], "settings": settings, **record})
 

@@ -12,7 +12,7 @@ from conftest import Memmlp, one_line
 from torch import Tensor, nn
 
 from memmlp.cli.bench import GRAPHS, summarize
-from memmlp.deploy.latency import InTurn
+from memmlp.deploy.latency import RoundTimes
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 
 BENCHED = ["profile=tiny", "model.depth=2", "model.heads=4"]
@@ -20,8 +20,8 @@ BENCHED = ["profile=tiny", "model.depth=2", "model.heads=4"]
 
 def test_a_summary_by_hand():
     seconds = np.array([[1, 2, 3], [4, 4, 4], [6, 6, 6]]) * 1e-3
-    base = InTurn(np.full((3, 2), 2e-3), np.ones(3))
-    found = summarize("pose_", InTurn(seconds, np.array([0.98, 0.7, 1.0])), base)
+    base = RoundTimes(np.full((3, 2), 2e-3), np.ones(3))
+    found = summarize("pose_", RoundTimes(seconds, np.array([0.98, 0.7, 1.0])), base)
     assert found["pose_median_ms"] == pytest.approx(4)
     assert [found[f"pose_ratio_{key}"] for key in ("least", "most")] == [1, 3]
     assert found["pose_ratio_to_avatar_poser"] == pytest.approx(2)

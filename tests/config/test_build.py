@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy.export import export
-from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
@@ -93,7 +93,7 @@ def train_and_stream(cfg: DictConfig) -> Arm:
     settings = experiment.evaluation
     results = {mode: settings.report(model, short, mode)["mean"] for mode in settings.modes}
     torch.manual_seed(0)
-    motion = evaluation.stream(model, [short.frames])[0]
+    motion = evaluation.predict_stream(model, [short.frames])[0]
     return Arm(model, [entry.values for entry in run.metrics()], motion, results)
 
 
@@ -152,7 +152,7 @@ def test_every_kind_of_graph_exports(overrides, tmp_path):
     model = network([*TINY, *SMALL, "vqvae.encoder_depth=1", "vqvae.decoder_depth=1", *overrides])
     export(model, tmp_path / "step.onnx", "0" * 16)
     clip = torch.randn(12, 252, generator=torch.Generator().manual_seed(0))
-    assert parity(model, tmp_path / "step.onnx", clip) <= TOLERANCE
+    assert measure_largest_difference(model, tmp_path / "step.onnx", clip) <= TOLERANCE
 
 
 def network(overrides: list[str]) -> MemMLP:

@@ -16,7 +16,7 @@ from conftest import one_line
 import memmlp as package
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
-from memmlp.deploy.lower_precision import lower
+from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import stream_onnx
 from memmlp.networks.streaming import streaming
@@ -32,7 +32,7 @@ CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     """The first tiny network's stream in float32 and in int8."""
     exact, quantised = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "int8.onnx"
-    lower("int8", exact, quantised, streaming(exported.NETWORKS["mem_mlp"]()), CLIPS)
+    write_lower_precision("int8", exact, quantised, streaming(exported.NETWORKS["mem_mlp"]()), CLIPS)
     return exact, quantised
 
 
@@ -53,7 +53,7 @@ def weights(graph: onnx.ModelProto) -> dict[str, int]:
 @pytest.mark.parametrize("network", ["mem_mlp", "avatar_jlm", "manikin_s"])
 def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, network):
     quantised, stream = tmp_path / "int8.onnx", streaming(exported.NETWORKS[network]())
-    lower("int8", step_files(network), quantised, stream, [CLIPS[0][:20]])
+    write_lower_precision("int8", step_files(network), quantised, stream, [CLIPS[0][:20]])
     kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
     assert inner

@@ -8,8 +8,8 @@ import pytest
 import tiny
 import torch
 
-from memmlp.deploy.export import save
-from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.deploy.export import export_module
+from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.motion.body import JOINTS
 
 pytestmark = pytest.mark.slow
@@ -24,13 +24,15 @@ def test_an_export_says_nothing_of_its_own_passes(tmp_path, caplog):
         def forward(self, x):
             return x, torch.ones(1, 40), torch.ones(1, 40)
 
-    save(SameTwice(), (torch.zeros(1),), ["x"], ["y", "ones.next", "again.next"], tmp_path / "step.onnx", {})
+    export_module(
+        SameTwice(), (torch.zeros(1),), ["x"], ["y", "ones.next", "again.next"], tmp_path / "step.onnx", {}
+    )
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
 def test_numbers_interface_and_metadata(naive_step):
     model, path = naive_step
-    assert parity(model, path, CLIP) <= TOLERANCE
+    assert measure_largest_difference(model, path, CLIP) <= TOLERANCE
     graph = onnx.load(path)
     inputs = {i.name: [d.dim_value for d in i.type.tensor_type.shape.dim] for i in graph.graph.input}
     outputs = {o.name: [d.dim_value for d in o.type.tensor_type.shape.dim] for o in graph.graph.output}

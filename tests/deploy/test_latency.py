@@ -46,17 +46,17 @@ def test_without_conversions_it_is_the_same_network(name):
 @pytest.mark.slow
 def test_latency_and_size(naive_step, small_yardstick, monkeypatch):
     model, path = naive_step
-    measured = latency.measure_step(path, steps=1)
+    measured = latency.measure_step_times(path, steps=1)
     assert measured["steps"] == 200
     assert 0 < measured["median_ms"] <= measured["p95_ms"]
     assert measured["ratio_to_yardstick"] > 0
     assert 0 < measured["core_share"] < 1.01
-    size = latency.size(model, model, path)
+    size = latency.measure_size(model, model, path)
     assert size["flops"] == 2 * size["macs"] > 0
     assert size["onnx_bytes"] == path.stat().st_size
     clock = iter([5.0, 5.0 + 1e-9])  # a thread without a core
     monkeypatch.setattr(latency.time, "thread_time", lambda: next(clock))
-    assert latency.measure_step(path, steps=1)["core_share"] < 1e-6
+    assert latency.measure_step_times(path, steps=1)["core_share"] < 1e-6
 
 
 def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(monkeypatch):
@@ -71,7 +71,7 @@ def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(
         clock["passed"] += 8 if order == ["a", "b", "b"] else 2
         return np.array([2.0])
 
-    found = latency.in_turn("ab", 3, time_round)
+    found = latency.time_in_rounds("ab", 3, time_round)
     assert order == ["a", "b", "b", "a", "a", "b"]
     assert found["a"].core_shares.tolist() == [1, 1, 1]
     assert found["b"].core_shares.tolist() == [1, 0.25, 1]

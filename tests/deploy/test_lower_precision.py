@@ -17,15 +17,15 @@ from onnxruntime import InferenceSession
 from memmlp.deploy.export import export
 from memmlp.deploy.lower_precision import (
     ZERO,
-    blocks,
     compare_accuracy,
+    convert_to_int8_blocks,
     find_inner_layers,
-    lower,
     measure_accuracy,
-    store_in_blocks,
+    quantise_in_blocks,
+    write_lower_precision,
 )
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.deploy.opsets import Constants
+from memmlp.deploy.opsets import GraphConstants
 from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.network_coordinates import Heading
@@ -47,16 +47,16 @@ def test_every_layer_between_the_ends_is_an_inner_one(step_files, network: str):
         if name.endswith("weight") and weight.ndim == 2
     }
     ends = [weight for name, weight in weights.items() if name.startswith(stream.float32_modules)]
-    inner, constants = set(find_inner_layers(graph, stream.float32_modules)), Constants(graph.graph)
+    inner, constants = set(find_inner_layers(graph, stream.float32_modules)), GraphConstants(graph.graph)
     left = [
         node.name
         for node in graph.graph.node
         if node.op_type in ("Gemm", "MatMul") and node.name not in inner and node.input[1] in constants
-        if _is_of(constants.value(node.input[1]), weights.values())
-        and not _is_of(constants.value(node.input[1]), ends)
+        if _is_of(constants.get_value(node.input[1]), weights.values())
+        and not _is_of(constants.get_value(node.input[1]), ends)
     ]
     assert left == []
-    products = [constants.value(node.input[1]) for node in graph.graph.node if node.name in inner]
+    products = [constants.get_value(node.input[1]) for node in graph.graph.node if node.name in inner]
     assert inner
     assert not any(_is_of(weight, ends) for weight in products)
 
@@ -69,7 +69,7 @@ def _is_of(constant: np.ndarray, weights: Iterable[np.ndarray]) -> bool:
 def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, network: str):
     source, path = step_files(network), tmp_path / "half.onnx"
     stream = streaming(exported.NETWORKS[network]())
-    lower("fp16", source, path, stream, [])
+    write_lower_precision("fp16", source, path, stream, [])
     made, inner = onnx.load(path), set(find_inner_layers(onnx.load(source), stream.float32_modules))
     onnx.checker.check_model(made, full_check=True)
     kinds = {tensor.name: tensor.data_type for tensor in made.graph.initializer}
@@ -107,9 +107,9 @@ def test_a_product_in_blocks_is_that_of_the_rounded_weight():
     rng = np.random.default_rng(0)
     weight, bias = rng.standard_normal((24, 70)).astype(np.float32), np.ones(24, np.float32)
     values = rng.standard_normal((1, 70)).astype(np.float32)
-    graph = store_in_blocks(one_product(weight, 1, bias), ["product"])
+    graph = convert_to_int8_blocks(one_product(weight, 1, bias), ["product"])
     made = InferenceSession(graph.SerializeToString()).run(None, {"x": values})[0]
-    rounded = restored(*blocks(values), 70) @ restored(*blocks(weight), 70).T + bias
+    rounded = restored(*quantise_in_blocks(values), 70) @ restored(*quantise_in_blocks(weight), 70).T + bias
     np.testing.assert_allclose(made, rounded, atol=2e-3)
     assert np.abs(made - (values @ weight.T + bias)).max() > 2e-3
 
@@ -119,7 +119,7 @@ def test_only_cells_are_in_blocks_and_the_motion_is_near(tmp_path: Path, cell: s
     stream = streaming(tiny.recurrent_poser(Heading(), cell=cell, width=40))
     exact, path = tmp_path / "exact.onnx", tmp_path / "blocks.onnx"
     export(stream, exact, "0" * 16)
-    lower("int8_blocks", exact, path, stream, [])
+    write_lower_precision("int8_blocks", exact, path, stream, [])
     before, after = (Counter(node.op_type for node in onnx.load(file).graph.node) for file in (exact, path))
     graph = onnx.load(path).graph
     layers = {n.input[1].removesuffix(".blocks") for n in graph.node if n.op_type == "MatMulNBits"}
@@ -141,7 +141,7 @@ def test_only_cells_are_in_blocks_and_the_motion_is_near(tmp_path: Path, cell: s
 def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     """The first tiny network's stream in float32 and in fp16."""
     exact, half = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "half.onnx"
-    lower("fp16", exact, half, streaming(exported.NETWORKS["mem_mlp"]()), [])
+    write_lower_precision("fp16", exact, half, streaming(exported.NETWORKS["mem_mlp"]()), [])
     return exact, half
 
 
@@ -162,9 +162,9 @@ def test_accuracy_is_that_of_the_evaluation(pair):
     model = exported.NETWORKS["mem_mlp"]()
     found = measure_accuracy(pair[0], model.normalizer, CLIPS)
     rows = []
-    for motion, clip in zip(evaluation.stream(model, CLIPS), CLIPS, strict=True):
+    for motion, clip in zip(evaluation.predict_stream(model, CLIPS), CLIPS, strict=True):
         apart = (motion[:, 132:] - clip[:, 54 + 132 :]).unflatten(-1, (22, 3))  # positions, metres
-        row = evaluation.rotations_report(model.normalizer, motion, clip)
+        row = evaluation.measure_rotation_branch(model.normalizer, motion, clip)
         rows.append(row | {"position MPJPE": 100 * float(apart.norm(dim=-1).mean())})
     for name, value in found.items():
         assert value == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-3), name

@@ -15,7 +15,7 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 from memmlp.common.errors import InputError
 from memmlp.config.schema import ExportConfig
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.deploy.opsets import NATIVE, OPSETS, convert
+from memmlp.deploy.opsets import NATIVE, OPSETS, convert_opset
 from memmlp.deploy.parity import TOLERANCE, stream_onnx
 
 CLIP = tiny.clip(20)
@@ -40,7 +40,7 @@ def test_a_step_computes_the_same_in_every_opset(
     assert exported.data_dependent(native.graph) == set()
     expected = stream_onnx(OnnxStream(source), CLIP)
     for opset in OPSETS if network == "mem_mlp" else (15, OPSETS[-1]):
-        made = convert(native, opset)
+        made = convert_opset(native, opset)
         onnx.checker.check_model(made, full_check=True)
         assert [(one.domain, one.version) for one in made.opset_import] == [("", opset)]
         assert [p.value for p in made.metadata_props] == [p.value for p in native.metadata_props]
@@ -61,11 +61,11 @@ def test_older_opsets_have_other_operators():
     x = np.arange(8, dtype=np.float32).reshape(2, 4) ** 2
     expected = run(graph, x)
     for opset in OPSETS:
-        np.testing.assert_allclose(run(convert(graph, opset), x), expected, rtol=1e-5)
-    kinds = {node.op_type for node in convert(graph, 16).graph.node}
+        np.testing.assert_allclose(run(convert_opset(graph, opset), x), expected, rtol=1e-5)
+    kinds = {node.op_type for node in convert_opset(graph, 16).graph.node}
     assert "LayerNormalization" not in kinds
-    assert "LayerNormalization" in {node.op_type for node in convert(graph, 17).graph.node}
-    assert "axes" not in {tensor.name for tensor in convert(graph, 15).graph.initializer}
+    assert "LayerNormalization" in {node.op_type for node in convert_opset(graph, 17).graph.node}
+    assert "axes" not in {tensor.name for tensor in convert_opset(graph, 15).graph.initializer}
 
 
 def run(graph: ModelProto, x: np.ndarray) -> np.ndarray:
@@ -75,10 +75,10 @@ def run(graph: ModelProto, x: np.ndarray) -> np.ndarray:
 
 def test_other_opsets_and_operators_without_an_older_form_are_rejected():
     with pytest.raises(InputError, match=r"opset=15: .*Mish"):
-        convert(model(helper.make_node("Mish", ["x"], ["y"])), 15)
+        convert_opset(model(helper.make_node("Mish", ["x"], ["y"])), 15)
     for opset in (14, 27):
         with pytest.raises(InputError, match=f"opset={opset}"):
-            convert(model(helper.make_node("Relu", ["x"], ["y"])), opset)
+            convert_opset(model(helper.make_node("Relu", ["x"], ["y"])), opset)
     rule = ExportConfig.__dataclass_fields__["opset"].metadata["rule"]
     assert [opset for opset in range(1, 40) if rule.allows(opset)] == list(OPSETS)
     assert ExportConfig.__dataclass_fields__["opset"].default == NATIVE

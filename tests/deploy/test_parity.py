@@ -18,10 +18,10 @@ from memmlp.deploy.parity import (
     MARGIN,
     ROUNDING,
     TOLERANCE,
-    clips_to_check,
-    differences,
     is_rounding,
-    parity,
+    measure_differences,
+    measure_largest_difference,
+    select_parity_clips,
     stream_onnx,
     stream_torch,
 )
@@ -39,11 +39,13 @@ def test_a_file_is_checked_with_a_full_past_where_a_clip_is_long_enough():
     model = exported.NETWORKS["mem_mlp"]()
     full = model.past_frames + model.frames
     clips = [tiny.clip(frames, seed=frames) for frames in (20, full + 100, 30)]
-    (longest,) = clips_to_check(model, clips)
+    (longest,) = select_parity_clips(model, clips)
     assert torch.equal(longest, clips[1][: full + MARGIN])
-    assert [len(clip) for clip in clips_to_check(model, clips, 2)] == [full + MARGIN, 30]
-    assert [len(clip) for clip in clips_to_check(model, clips[1:])] == [full + 100]  # as long as the first
-    assert clips_to_check(model, clips, 0) == clips
+    assert [len(clip) for clip in select_parity_clips(model, clips, 2)] == [full + MARGIN, 30]
+    assert [len(clip) for clip in select_parity_clips(model, clips[1:])] == [
+        full + 100
+    ]  # as long as the first
+    assert select_parity_clips(model, clips, 0) == clips
 
 
 def test_a_forgotten_past_is_a_difference_that_a_short_clip_hides():
@@ -51,7 +53,7 @@ def test_a_forgotten_past_is_a_difference_that_a_short_clip_hides():
     model = tiny.model(NoCodesMemory, coordinates=Heading())
     broken = copy.deepcopy(model)
     broken.memory.remember = lambda motion, past, state, new: {"motion": torch.zeros_like(state["motion"])}
-    (clip,) = clips_to_check(model, [tiny.clip(200)])
+    (clip,) = select_parity_clips(model, [tiny.clip(200)])
     long, short = (
         float((stream_torch(model, one) - stream_torch(broken, one)).abs().max())
         for one in (clip, clip[: model.frames])
@@ -61,10 +63,10 @@ def test_a_forgotten_past_is_a_difference_that_a_short_clip_hides():
 
 def test_a_file_of_another_network_does_not_match(step_files: Callable[[str], Path]):
     model, path = exported.NETWORKS["mem_mlp"](), step_files("mem_mlp")
-    assert parity(model, path, CLIP) <= TOLERANCE
+    assert measure_largest_difference(model, path, CLIP) <= TOLERANCE
     with torch.no_grad():
         model.stem.bias += 2e-3
-    apart = differences(model, path, CLIP)
+    apart = measure_differences(model, path, CLIP)
     assert apart.max() > TOLERANCE
     assert not is_rounding(apart)
 
@@ -77,10 +79,10 @@ def test_almost_parallel_columns_are_no_failure(tmp_path):
     export(streaming(model), path, "0123456789abcdef")
     with torch.no_grad():
         model.head.bias.view(22, 6)[9, 3] += 1e-3  # 4e-6 of the rotation, the rounding of a large network
-    assert parity(model, path, CLIP) <= TOLERANCE
+    assert measure_largest_difference(model, path, CLIP) <= TOLERANCE
     assert float((stream_torch(model, CLIP) - stream_onnx(OnnxStream(path), CLIP)).abs().max()) > TOLERANCE
     model.normalizer.rest[15] += 0.01  # of the joints alone
-    assert parity(model, path, CLIP) > TOLERANCE
+    assert measure_largest_difference(model, path, CLIP) > TOLERANCE
 
 
 def test_larger_differences_need_a_small_median():

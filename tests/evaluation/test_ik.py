@@ -7,7 +7,7 @@ from torch import Tensor
 
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import LBFGS, Arms, JointDistance, NoIK
-from memmlp.evaluation.modes import clip_report, local_rotations, stream
+from memmlp.evaluation.modes import extract_rotations, measure_clip, predict_stream
 from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
 from memmlp.motion.network_coordinates import Heading
@@ -22,7 +22,7 @@ def perturbed(size: float, seed: int = 0) -> Tensor:
     """Return the motion (40, 198) with every rotation turned by some `size` radians and true positions."""
     draw = torch.Generator().manual_seed(seed)
     turn = size * torch.randn(len(MOTION), N_JOINTS, 3, generator=draw)
-    local = local_rotations(MOTION) @ axis_angle_to_matrix(turn)
+    local = extract_rotations(MOTION) @ axis_angle_to_matrix(turn)
     return torch.cat([matrix_to_sixd(local).flatten(1), MOTION[:, POSITION]], -1)
 
 
@@ -36,7 +36,7 @@ def objective(motion: Tensor) -> JointDistance:
     """Return the objective of a motion, in float64."""
     head = SPARSE[: len(motion), 36:39].double()
     target = motion[:, POSITION].double().unflatten(-1, (N_JOINTS, 3)) - head[:, None]
-    return JointDistance(local_rotations(motion.double()), target, NORMALIZER.rest.double())
+    return JointDistance(extract_rotations(motion.double()), target, NORMALIZER.rest.double())
 
 
 def solve(motion: Tensor, iterations: int = 15) -> Tensor:
@@ -47,7 +47,7 @@ def test_only_rotations_that_move_joints_are_changed():
     motion = perturbed(0.2)
     solved = solve(motion)
     assert torch.equal(solved[:, POSITION], motion[:, POSITION])
-    change = (local_rotations(solved) - local_rotations(motion)).abs().amax((0, 2, 3))
+    change = (extract_rotations(solved) - extract_rotations(motion)).abs().amax((0, 2, 3))
     assert float(change[LEAVES].max()) < 1e-6
     others = [joint for joint in range(N_JOINTS) if joint not in LEAVES]
     assert float(change[others].min()) > 1e-3
@@ -115,12 +115,12 @@ def test_evaluation_reports_a_third_branch_with_the_rotation_branchs_metrics():
 def test_arms_reach_as_those_of_a_network_that_reaches():
     """They need no positions, and leave all but head, arms and hands as they are."""
     models = [tiny.recurrent_poser(Heading(), output=output) for output in ("global", "reaching")]
-    plain, reaching = (stream(model, [TRUTH])[0] for model in models)
+    plain, reaching = (predict_stream(model, [TRUTH])[0] for model in models)
     normalizer = tiny.normalizer(Heading())
     solved = Arms().solutions(normalizer, plain, TRUTH[:, :SPARSE_DIM])["combined"]
-    before, found, expected = map(local_rotations, (plain, solved, reaching))
+    before, found, expected = map(extract_rotations, (plain, solved, reaching))
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     torch.testing.assert_close(found[:, :12], before[:, :12])  # legs, hips and spine
     assert torch.equal(solved[:, POSITION], plain[:, POSITION])
-    report = clip_report(normalizer, plain, TRUTH, Arms())
+    report = measure_clip(normalizer, plain, TRUTH, Arms())
     assert report["combined"]["Hand PE"] < 0.8 * report["rotation"]["Hand PE"]

@@ -12,8 +12,8 @@ from memmlp.evaluation import metrics
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.evaluation.modes import (
-    stream,
-    window,
+    predict_stream,
+    predict_windows,
 )
 from memmlp.motion.body import MOTION_DIM, POSITION, SPARSE_DIM
 
@@ -38,7 +38,7 @@ def test_rotation_metrics_are_numpys(near_pi, seed):
     between = Rotation.from_matrix(a[:, 1:].reshape(-1, 3, 3)).inv() * Rotation.from_matrix(
         b[:, 1:].reshape(-1, 3, 3)
     )
-    report = metrics.rotations_report(torch.tensor(a), torch.tensor(b))
+    report = metrics.measure_rotations(torch.tensor(a), torch.tensor(b))
     assert report["MPJRE"] == pytest.approx(np.rad2deg(np.abs(wrapped).mean()), abs=1e-5)
     assert report["geodesic"] == pytest.approx(np.rad2deg(between.magnitude().mean()), abs=1e-5)
 
@@ -47,7 +47,7 @@ def test_position_metrics_are_numpys():
     rng = np.random.default_rng(0)
     truth = np.cumsum(rng.normal(size=(30, 22, 3)) * 0.01, 0)
     predicted = truth + rng.normal(size=truth.shape) * 0.05
-    report = metrics.positions_report(torch.tensor(predicted), torch.tensor(truth))
+    report = metrics.measure_positions(torch.tensor(predicted), torch.tensor(truth))
     error = 100 * np.sqrt(((predicted - truth) ** 2).sum(-1))
     upper, lower = [3, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21], [0, 1, 2, 4, 5, 7, 8, 10, 11]
     velocity = [
@@ -98,9 +98,9 @@ def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
             return torch.full((len(sparse), self.frames, MOTION_DIM), float(self.calls)), state
 
     clip = tiny.clip(17)
-    calls = window(Counter([clip]), [clip])[0][:, 0]
+    calls = predict_windows(Counter([clip]), [clip])[0][:, 0]
     assert calls.tolist() == [1.0] * 7 + [2.0] * 7 + [3.0] * 3
-    assert stream(Counter([clip]), [clip])[0][:, 0].tolist() == list(range(1, 18))
+    assert predict_stream(Counter([clip]), [clip])[0][:, 0].tolist() == list(range(1, 18))
 
 
 @pytest.mark.parametrize("length", [15, 21])
@@ -121,7 +121,7 @@ def test_the_tail_window_recalls_the_window_before_it(length, monkeypatch):
         return past
 
     monkeypatch.setattr(model.memory, "recall", spied)
-    window(model, clips)
+    predict_windows(model, clips)
     inputs, recalled = seen[2]
     assert inputs[-7:] == list(range(length - 6, length + 1))
     assert recalled == list(range(length - 13, length - 6))

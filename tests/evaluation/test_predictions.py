@@ -14,12 +14,12 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation import evaluation
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import LBFGS, NoIK
-from memmlp.evaluation.modes import stream
+from memmlp.evaluation.modes import predict_stream
 from memmlp.evaluation.predictions import (
     ClipPredictor,
-    motion_clip,
+    make_clip,
+    make_prediction_arrays,
     predict_clip,
-    prediction_arrays,
     save_predictions,
 )
 from memmlp.motion.body import SPARSE_DIM
@@ -83,7 +83,7 @@ def test_the_body_may_have_its_pelvis_anywhere():
     """`trans` is the root less the rest pose's root, as AMASS has it."""
     given, shifted = frames(source(30)), BODY + np.array([0.1, -0.24, 0.03])
     arrays = predict_clip(NETWORK, given, "stream")
-    clip = motion_clip("clip", arrays["predicted_rotations"], arrays["predicted_positions"], shifted)
+    clip = make_clip("clip", arrays["predicted_rotations"], arrays["predicted_positions"], shifted)
     np.testing.assert_allclose(clip.trans + shifted[0], arrays["predicted_positions"][:, 0], atol=1e-6)
 
 
@@ -96,8 +96,8 @@ def test_the_truth_is_what_came_in():
 def test_inverse_kinematics_brings_it_to_the_position_branch():
     given, ik = frames(source(12)), LBFGS(5)
     (clip,) = predictor(branch="combined", ik=ik).predict(["clip"], [given])
-    motion = stream(NETWORK, [given])[0]
-    expected = prediction_arrays(NETWORK.normalizer, given, motion, ik)["combined_positions"]
+    motion = predict_stream(NETWORK, [given])[0]
+    expected = make_prediction_arrays(NETWORK.normalizer, given, motion, ik)["combined_positions"]
     np.testing.assert_allclose(joints(clip), expected, atol=1e-5)
     (plain,) = predictor(ik=ik).predict(["clip"], [given])
     assert np.abs(joints(plain) - expected).max() > 1e-3
@@ -116,7 +116,7 @@ def test_a_folder_is_predicted_as_its_clips_are(tmp_path: Path):
         "d.npz",
     ]
     assert [each.file for each in report.skipped] == ["bad.npz", "short.npz"]
-    assert report.skipped[1].reason.startswith("one frame at 60 Hz")
+    assert report.skipped[1].reason.startswith("has one frame at 60 Hz")
     for name, stride in (("a", 1), ("b/c", 2), ("d", 1)):
         before = read_clip(tmp_path / "in" / f"{name}.npz", name)
         at_60 = Clip(name, before.poses[::stride], before.trans[::stride], 60.0)

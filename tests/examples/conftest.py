@@ -37,9 +37,9 @@ class Played(NamedTuple):
 
 def trackers(space: str) -> np.ndarray:
     """Head, left and right of the clip (N, 3, 7), x y z qx qy qz qw."""
-    rotations = SPACES[space].rotations_out(PERSON.rotations)
+    rotations = SPACES[space].convert_rotations_from_amass(PERSON.rotations)
     quaternions = matrix_to_quaternion(rotations.reshape(-1, 3, 3)).reshape(-1, 3, 4)
-    return np.concatenate([SPACES[space].positions_out(PERSON.positions), quaternions], -1)
+    return np.concatenate([SPACES[space].convert_positions_from_amass(PERSON.positions), quaternions], -1)
 
 
 @pytest.fixture(scope="session")
@@ -56,7 +56,10 @@ def played(
                 export(network, space)
                 runpy.run_path(str(EXAMPLES / "trackers.py"))["write"](path, trackers(space))
         there = SPACES[space]
-        given = there.positions_out(PERSON.positions), there.rotations_out(PERSON.rotations)
+        given = (
+            there.convert_positions_from_amass(PERSON.positions),
+            there.convert_rotations_from_amass(PERSON.rotations),
+        )
         return Played(network, path, wearer.play(Stream(step_files("mem_mlp"), space=space), *given))
 
     return play

@@ -12,7 +12,7 @@ import pytest
 from examples.conftest import EXAMPLES
 from scipy.spatial.transform import Rotation
 
-from memmlp.live.session.sources import from_json
+from memmlp.live.session.sources import parse_json_packet
 
 SEND = EXAMPLES / "udp/send.py"
 sender = runpy.run_path(str(SEND))
@@ -38,6 +38,6 @@ def test_it_sends_what_live_takes():
         subprocess.run(
             [sys.executable, str(SEND), "--port", str(port), "--seconds", "0.1"], check=True, timeout=60
         )
-        packets = [from_json(listener.recv(65536)) for _ in range(6)]
+        packets = [parse_json_packet(listener.recv(65536)) for _ in range(6)]
     assert [packet.time for packet in packets] == pytest.approx([frame / 60 for frame in range(6)])
     assert all(tracker is not None for packet in packets for tracker in packet.trackers)

@@ -20,7 +20,7 @@ from vmc_receiver import TREE, Marionette, posed
 from wearer import body_frame
 
 from memmlp.common.errors import InputError
-from memmlp.live.outputs import VMC, Outputs, Receiver, Recorder, VRChat, euler_degrees, place_trackers
+from memmlp.live.outputs import VMC, Outputs, Receiver, Recorder, VRChat, compute_euler_angles, place_trackers
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import BodyFrame, Stream
 from memmlp.motion.body import JOINTS, N_JOINTS, builtin_rest_joints
@@ -103,8 +103,8 @@ def test_vmc_and_files_have_the_joints_of_a_tall_wearer_s_stream(
     files = {kind: tmp_path / f"played.{kind}" for kind in ("npz", "bvh", "glb")}
     recorder = Recorder(list(files.values()), stream.network.body.rest, stream.network.fps, print)
     outputs = Outputs([VMC(Receiver("127.0.0.1", marionette.port, "--vmc")), recorder], pytest.fail)
-    positions = space.positions_out(person.positions * SIZE + [0, 0, FLOOR])
-    rotations = space.rotations_out(person.rotations)
+    positions = space.convert_positions_from_amass(person.positions * SIZE + [0, 0, FLOOR])
+    rotations = space.convert_rotations_from_amass(person.rotations)
     poses, received = [], []
     for index in range(count):
         trackers = list(zip(positions[index], rotations[index], strict=True))
@@ -137,7 +137,7 @@ def test_vmc_and_files_have_the_joints_of_a_tall_wearer_s_stream(
     local = axis_angle_to_matrix(torch.tensor(clip.poses, dtype=torch.float64))
     root = torch.tensor(clip.trans, dtype=torch.float64) + tiny.REST[0]
     joints = forward_kinematics(local, root, tiny.REST)[1].numpy().reshape(-1, N_JOINTS, 3)
-    assert apart(joints, space.positions_in(poses) / SIZE) < MILLIMETRE
+    assert apart(joints, space.convert_positions_to_amass(poses) / SIZE) < MILLIMETRE
 
 
 def apart(ours: np.ndarray, theirs: np.ndarray) -> float:
@@ -185,7 +185,7 @@ ANGLE = st.sampled_from([0.0, 90.0, -90.0, 180.0]) | st.floats(-180, 180)
 @example(-90.0, 30.0, 20.0)
 def test_angles_are_applied_about_z_then_x_then_y(x: float, y: float, z: float):
     expected = of_axis(1, y) @ of_axis(0, x) @ of_axis(2, z)
-    again = euler_degrees(expected[None])[0]
+    again = compute_euler_angles(expected[None])[0]
     found = of_axis(1, again[1]) @ of_axis(0, again[0]) @ of_axis(2, again[2])
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
@@ -246,7 +246,7 @@ def test_missing_frames_are_interpolated_and_breaks_left_out(tmp_path: Path):
                 recorder.take(frame(start + index / 60, restarted=start != 5 and index == 0))
         recorder.close()
         assert len(read_clip(tmp_path / f"{number}.npz", "a")) == 20
-        assert lines[-1].endswith("0.3 s, 1 break left out")
+        assert lines[-1].endswith("0.3 s, 1 break skipped")
 
 
 def test_bad_files_are_rejected_at_once_and_nothing_is_written_without_a_frame(tmp_path: Path):

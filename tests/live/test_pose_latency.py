@@ -2,15 +2,15 @@
 
 import pytest
 
-from memmlp.live.pose_latency import measure_pose, time_poses_in_turn
+from memmlp.live.pose_latency import measure_pose_times, time_poses_in_rounds
 
 pytestmark = pytest.mark.slow
 
 
 def test_a_whole_pose_is_timed(step_files):
     file = step_files("no_memory")
-    found = measure_pose(file, 1)
+    found = measure_pose_times(file, 1)
     assert 0 < found["pose_median_ms"] <= found["pose_p95_ms"]
     assert 0 < found["pose_core_share"] < 1.01
-    (times,) = time_poses_in_turn({"one": file}, 2, 3).values()
+    (times,) = time_poses_in_rounds({"one": file}, 2, 3).values()
     assert (times.seconds.shape, times.core_shares.shape) == ((2, 3), (2,))

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from memmlp.live.rotations import BodyTree, rotate_by_share, sixd_to_matrix, slerp
+from memmlp.live.rotations import BodyTree, rotate_by_fraction, sixd_to_matrix, slerp
 from memmlp.motion import geometry
 from memmlp.motion.body import HEAD, JOINTS, PARENTS, builtin_rest_joints
 
@@ -19,7 +19,7 @@ def test_gram_schmidt_and_forward_kinematics_are_those_of_torch():
     np.testing.assert_allclose(sixd_to_matrix(sixd), expected, atol=1e-12)
     root = torch.zeros(3).double()
     _, expected = geometry.forward_kinematics(torch.tensor(LOCAL), root, torch.tensor(rest))
-    found = BodyTree(JOINTS, PARENTS, rest).positions(LOCAL)
+    found = BodyTree(JOINTS, PARENTS, rest).compute_positions(LOCAL)
     np.testing.assert_allclose(found, (expected - expected[HEAD]).numpy(), atol=2e-6)
 
 
@@ -33,5 +33,5 @@ def test_slerp_is_scipys():
 
 def test_a_share_of_no_turn_is_no_turn():
     tiny = Rotation.from_rotvec([[0, 0, 0], [1e-12, 0, 0], [2e-3, 0, 0]]).as_matrix()
-    found = Rotation.from_matrix(rotate_by_share(tiny, np.full(3, 0.5))).as_rotvec()
+    found = Rotation.from_matrix(rotate_by_fraction(tiny, np.full(3, 0.5))).as_rotvec()
     np.testing.assert_allclose(found, [[0, 0, 0], [5e-13, 0, 0], [1e-3, 0, 0]], atol=1e-14)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
-from memmlp.live.spaces import SPACES, space_of
+from memmlp.live.spaces import SPACES, find_space
 
 numbers = st.floats(-10, 10)
 points = st.tuples(numbers, numbers, numbers).map(np.array)
@@ -23,39 +23,49 @@ FORWARD, UP, LEFT = np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.array([-1.0
 @given(names, points, turns)
 def test_there_and_back(name, point, turn):
     space = SPACES[name]
-    np.testing.assert_allclose(space.positions_out(space.positions_in(point)), point, atol=1e-12)
-    np.testing.assert_allclose(space.rotations_out(space.rotations_in(turn)), turn, atol=1e-12)
+    np.testing.assert_allclose(
+        space.convert_positions_from_amass(space.convert_positions_to_amass(point)), point, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        space.convert_rotations_from_amass(space.convert_rotations_to_amass(turn)), turn, atol=1e-12
+    )
     pose = np.stack([turn, turn.T, turn @ turn])
-    np.testing.assert_allclose(space.pose_out(space.pose_in(pose)), pose, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(space.pose_out(pose)), 1, atol=1e-9)
+    np.testing.assert_allclose(
+        space.convert_pose_from_amass(space.convert_pose_to_amass(pose)), pose, atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(space.convert_pose_from_amass(pose)), 1, atol=1e-9)
 
 
 @given(names, points, turns, turns)
 def test_a_chain_of_joints_is_the_same_in_every_space(name, offset, root, local):
     """A child at a rest offset, turned and moved in AMASS' world or in the space, is the same point."""
     space = SPACES[name]
-    there_root, there_local = space.pose_out(np.stack([root, local]))
+    there_root, there_local = space.convert_pose_from_amass(np.stack([root, local]))
     there_offset = offset * space.body  # the T-pose's axes
-    np.testing.assert_allclose(there_root @ there_offset, space.positions_out(root @ offset), atol=1e-9)
-    np.testing.assert_allclose(there_root @ there_local, space.rotations_out(root @ local), atol=1e-9)
+    np.testing.assert_allclose(
+        there_root @ there_offset, space.convert_positions_from_amass(root @ offset), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        there_root @ there_local, space.convert_rotations_from_amass(root @ local), atol=1e-9
+    )
 
 
 def test_the_axes():
     for name, forward, left_turn in (("openxr", (0, 0, -1), 1), ("unity", (0, 0, 1), -1)):
         space = SPACES[name]
         for there, here in ((forward, FORWARD), ((0, 1, 0), UP), ((-1, 0, 0), LEFT)):
-            np.testing.assert_allclose(space.positions_in(np.array(there, float)), here)
+            np.testing.assert_allclose(space.convert_positions_to_amass(np.array(there, float)), here)
         # the identity is a person upright who looks forward: SMPL's +Z is forward, its +X left
-        upright = space.rotations_in(np.eye(3))
+        upright = space.convert_rotations_to_amass(np.eye(3))
         np.testing.assert_allclose(upright, np.stack([LEFT, UP, FORWARD], 1), atol=1e-12)
         # a turn to the left is about +Y in openxr (right-handed) and about -Y in unity (left-handed)
         turn = Rotation.from_rotvec([0, left_turn * np.pi / 2, 0]).as_matrix()
-        np.testing.assert_allclose(space.rotations_in(turn) @ [0, 0, 1], LEFT, atol=1e-12)
+        np.testing.assert_allclose(space.convert_rotations_to_amass(turn) @ [0, 0, 1], LEFT, atol=1e-12)
 
 
 def test_an_unknown_space_is_refused():
     with pytest.raises(InputError, match="space=maya"):
-        space_of("maya")
+        find_space("maya")
 
 
 @given(turns)

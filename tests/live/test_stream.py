@@ -22,12 +22,12 @@ import memmlp
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
 from memmlp.evaluation.ik import LBFGS
-from memmlp.evaluation.modes import joint_positions, local_rotations, stream
+from memmlp.evaluation.modes import extract_positions, extract_rotations, predict_stream
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.tracker_input import SampleWarning
-from memmlp.live.tracker_resampling import t_pose
+from memmlp.live.tracker_resampling import make_t_pose
 from memmlp.live.wearer import Offsets
 from memmlp.motion.body import HEAD, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
@@ -62,7 +62,7 @@ def undisturbed(file) -> np.ndarray:
 def test_inverse_kinematics_bring_the_pose_to_the_position_branch(network, file):
     solved = wearer.play(Stream(file, ik=LBFGS()), PERSON.positions[:20], PERSON.rotations[:20])
     frames = PERSON.frames[:19]
-    motion = stream(network, [frames])[0]
+    motion = predict_stream(network, [frames])[0]
     expected = LBFGS().solutions(network.normalizer, motion, frames[:, :SPARSE_DIM])["combined"]
     there = network.normalizer.pose(expected, frames[:, :SPARSE_DIM]).numpy()
     assert wearer.apart(wearer.joints(solved[1:]), there).max() < 0.1
@@ -74,11 +74,11 @@ def largest_difference(network, file: Path, person: wearer.Person) -> float:
     It is over rotations, positions and joints.
     """
     poses = wearer.play(Stream(file), person.positions, person.rotations)[1:]
-    motion = stream(network, [person.frames])[0]
+    motion = predict_stream(network, [person.frames])[0]
     pairs = [
         (wearer.joints(poses), network.normalizer.pose(motion, person.frames[:, :SPARSE_DIM])),
-        (np.stack([pose.position_branch for pose in poses]), joint_positions(motion)),
-        (np.stack([pose.rotations for pose in poses]), local_rotations(motion)),
+        (np.stack([pose.position_branch for pose in poses]), extract_positions(motion)),
+        (np.stack([pose.rotations for pose in poses]), extract_rotations(motion)),
     ]
     return max(float(np.abs(ours - theirs.numpy()).max()) for ours, theirs in pairs)
 
@@ -234,22 +234,28 @@ def test_calibration_finds_how_the_devices_sit(name, file):
 
     def devices(positions, rotations):
         away = (rotations @ sits[:, :, None])[..., 0]
-        turned = space.rotations_out(rotations) @ turns.swapaxes(1, 2)
-        return [*zip(space.positions_out(positions + away), turned, strict=True)]
+        turned = space.convert_rotations_from_amass(rotations) @ turns.swapaxes(1, 2)
+        return [*zip(space.convert_positions_from_amass(positions + away), turned, strict=True)]
 
-    pose = t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), 2.1)
+    pose = make_t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), 2.1)
     with pytest.warns(SampleWarning, match="138 degrees from upright"):
         offsets = stream.calibrate(*devices(pose.positions, pose.rotations))
     np.testing.assert_allclose(offsets.rotations, turns, atol=1e-9)
     mean = (pose.rotations @ sits[:, :, None])[..., 0].mean(0)
     rotations = np.stack([rotation for _, rotation in devices(pose.positions, pose.rotations)])
     missing = (rotations @ (offsets.positions - shifts)[:, :, None])[..., 0]
-    np.testing.assert_allclose(missing, np.tile(space.positions_out(mean), (3, 1)), atol=1e-9)
+    np.testing.assert_allclose(missing, np.tile(space.convert_positions_from_amass(mean), (3, 1)), atol=1e-9)
     exact = Stream(file, space=name, offsets=Offsets(shifts, turns))
     plain = Stream(file, space=name)
     for index in range(20):
         person = PERSON.positions[index], PERSON.rotations[index]
-        joint = plain.step(*zip(space.positions_out(person[0]), space.rotations_out(person[1]), strict=True))
+        joint = plain.step(
+            *zip(
+                space.convert_positions_from_amass(person[0]),
+                space.convert_rotations_from_amass(person[1]),
+                strict=True,
+            )
+        )
         np.testing.assert_allclose(exact.step(*devices(*person)).positions, joint.positions, atol=1e-4)
 
 
@@ -257,9 +263,13 @@ def test_devices_that_no_t_pose_has_there_are_not_calibrated(file):
     """Exchanged controllers, hanging arms and centimetres would move every later pose silently."""
     space, stream = SPACES["unity"], Stream(file, space="unity")
     for heading, tilt in ((0.0, 0), (2.1, 40), (-3.0, -40)):
-        pose = t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), heading)
+        pose = make_t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), heading)
         tilted = pose.rotations @ Rotation.from_euler("x", tilt, degrees=True).as_matrix()
-        head, left, right = zip(space.positions_out(pose.positions), space.rotations_out(tilted), strict=True)
+        head, left, right = zip(
+            space.convert_positions_from_amass(pose.positions),
+            space.convert_rotations_from_amass(tilted),
+            strict=True,
+        )
         before = stream.offsets
         with pytest.raises(InputError, match=r"calibrate: .*exchanged"):
             stream.calibrate(head, right, left)
@@ -267,20 +277,20 @@ def test_devices_that_no_t_pose_has_there_are_not_calibrated(file):
         before = stream.calibrate(head, left, right)
     arms = 0.4 * pose.positions + 0.6 * pose.positions[0] - [[0, 0, 0], [0, 0, 0.7], [0, 0, 0.7]]
     for wrong, said in (
-        (space.positions_out(arms), r"calibrate: \w+ is \d\d cm"),
-        (100 * space.positions_out(pose.positions), r"is \d{4} cm .* positions are in metres"),
+        (space.convert_positions_from_amass(arms), r"calibrate: \w+ is \d\d cm"),
+        (100 * space.convert_positions_from_amass(pose.positions), r"is \d{4} cm .* positions are in metres"),
     ):
         with pytest.raises(InputError, match=said):
-            stream.calibrate(*zip(wrong, space.rotations_out(pose.rotations), strict=True))
+            stream.calibrate(*zip(wrong, space.convert_rotations_from_amass(pose.rotations), strict=True))
         assert stream.offsets is before
 
 
 def test_quaternions_in_another_order_are_warned_of(file):
     """A head that seems to hang or to lie is no person in T-pose, unless the device is mounted so."""
     space, stream = SPACES["openxr"], Stream(file, space="openxr")
-    pose = t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), 0.4)
-    places = space.positions_out(pose.positions)
-    xyzw = matrix_to_quaternion(space.rotations_out(pose.rotations))
+    pose = make_t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), 0.4)
+    places = space.convert_positions_from_amass(pose.positions)
+    xyzw = matrix_to_quaternion(space.convert_rotations_from_amass(pose.rotations))
     stream.calibrate(*zip(places, xyzw, strict=True))
     with pytest.warns(SampleWarning, match=r"calibrate: the head's device is \d+ degrees .* xyzw") as warned:
         offsets = stream.calibrate(*zip(places, np.roll(xyzw, 1, axis=1), strict=True))
@@ -288,14 +298,14 @@ def test_quaternions_in_another_order_are_warned_of(file):
     assert stream.offsets is offsets
     tilted = pose.rotations @ Rotation.from_euler("z", 70, degrees=True).as_matrix()
     with pytest.warns(SampleWarning, match="head's device is 70 degrees from upright"):
-        stream.calibrate(*zip(places, space.rotations_out(tilted), strict=True))
+        stream.calibrate(*zip(places, space.convert_rotations_from_amass(tilted), strict=True))
 
 
 # A long stream
 
 
 def test_a_long_stream_neither_drifts_nor_grows(file):
-    truth = joint_positions(PERSON.frames[:, SPARSE_DIM:]).numpy()
+    truth = extract_positions(PERSON.frames[:, SPARSE_DIM:]).numpy()
     stream, errors = Stream(file), []
     for time in range(6):
         for at in range(FRAMES - 1):
@@ -353,7 +363,7 @@ def test_bad_arguments_are_rejected(file, step_files):
         (lambda: Stream(file, offsets=Offsets(np.zeros(3), np.eye(3))), "offsets: shapes"),
         (lambda: Stream(file).calibrate(one, one, one), "calibrate: the hands are not apart"),
         (lambda: Stream(file).calibrate(one, None, one), r"calibrate: .*left"),
-        (lambda: Stream(file).step(one, two, one), "left: a quaternion of norm 2"),
+        (lambda: Stream(file).step(one, two, one), "left: quaternion has norm 2"),
         (lambda: Stream(file).step(one, one, one, "1.0"), "time="),
     ):
         with pytest.raises(InputError, match=words):

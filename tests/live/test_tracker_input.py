@@ -44,7 +44,10 @@ def test_usual_times_cause_no_warning():
 
 
 def test_times_of_no_clock_are_reported_once():
-    for start, words in ((1e5, "milliseconds so late"), (1.7e9, "does `time` stand still?")):
+    for start, words in (
+        (1e5, "times in single precision"),
+        (1.7e9, "does not stand still"),
+    ):
         said = warnings_for(float(np.float32(start + n / 60)) for n in range(300))
         assert sum(words in line for line in said) == 1
         assert len(said) == len(set(said))
@@ -54,7 +57,7 @@ def test_times_of_no_clock_are_reported_once():
 def test_units_other_than_metres_are_reported():
     for unit in (100, 1000, 39.4):  # centimetres, millimetres, inches
         far, high = warnings_for([None] * STILL, unit * STANDING)
-        assert far.startswith(f"{JUMPS} samples in a row have a hand over 5 m from the head")
+        assert far.startswith(f"{JUMPS} consecutive samples have a hand over 5 m from the head")
         assert "have the head over 3 m above the floor" in high
         assert warnings_for([None] * (JUMPS - 1), unit * STANDING) == []
         assert warnings_for([None] * STILL, unit * STANDING, NO_HANDS) == [high]
@@ -92,11 +95,11 @@ def test_a_stream_warns_at_the_line_of_its_caller(step_files):
 
 def test_bad_trackers_are_rejected():
     for tracker, words in (
-        (([0, 0], np.eye(3)), "left: a position of shape .2,."),
-        (([0, 0, 0], np.eye(4)), "left: a rotation of shape .4, 4."),
-        (([0, 0, 0], [0, 0, 0, 2]), "left: a quaternion of norm 2;"),
-        (([0, 0, 0], 2 * np.eye(3)), "left: the matrix is not orthonormal"),
-        (([0, 0, 0], np.diag([1, 1, -1])), "left: the matrix is a mirror image"),
+        (([0, 0], np.eye(3)), "left: position has shape .2,."),
+        (([0, 0, 0], np.eye(4)), "left: rotation has shape .4, 4."),
+        (([0, 0, 0], [0, 0, 0, 2]), "left: quaternion has norm 2;"),
+        (([0, 0, 0], 2 * np.eye(3)), "left: .*not orthonormal"),
+        (([0, 0, 0], np.diag([1, 1, -1])), "left: .*mirrors"),
         ("no", "left: expected .position, rotation."),
         (([0, 0, 0],), "left: expected .position, rotation."),
     ):

@@ -10,13 +10,13 @@ import wearer
 from memmlp.live.rotations import BodyTree
 from memmlp.live.tracker_resampling import (
     NONE_LOST,
-    Features,
-    Hold,
+    FeatureWriter,
+    LostTrackerFiller,
     TrackerFrames,
     TrackerSample,
-    heading_of,
-    rotation_about_vertical,
-    t_pose,
+    compute_heading,
+    make_t_pose,
+    make_vertical_rotation,
 )
 from memmlp.motion.body import JOINTS, PARENTS, SPARSE_DIM
 
@@ -32,7 +32,7 @@ def frames_of(times: np.ndarray) -> list[TrackerSample]:
     return [frame for sample in samples for frame in trackers.take(*sample, NONE_LOST)[0]]
 
 
-def filled(lost: tuple[bool, ...], first: int, count: int, hold: Hold) -> np.ndarray:
+def filled(lost: tuple[bool, ...], first: int, count: int, hold: LostTrackerFiller) -> np.ndarray:
     """Return the positions (240, 3, 3) of all trackers, some of which are lost for a while."""
     gone = range(first, first + count)
     return np.stack([hold.fill(s, lost if i in gone else NONE_LOST).positions for i, s in enumerate(SAMPLES)])
@@ -74,32 +74,32 @@ def test_a_return_is_no_jump():
     """After a loss of half a second the fastest tracker has 4.38 to 4.61 m/s; with a jump 48 to 53."""
     assert speed(PERSON.positions[129:160]) == pytest.approx(4.29, abs=0.01)
     for lost in ((False, True, False), (True, False, False), (False, True, True)):
-        assert speed(filled(lost, 100, 30, Hold(SKELETON))[129:160]) < 4.8
-        assert speed(filled(lost, 100, 30, Hold(SKELETON, recovery=0))[129:160]) > 40
+        assert speed(filled(lost, 100, 30, LostTrackerFiller(SKELETON))[129:160]) < 4.8
+        assert speed(filled(lost, 100, 30, LostTrackerFiller(SKELETON, recovery=0))[129:160]) > 40
 
 
 def test_a_hand_is_held_as_the_head_sees_it_and_a_head_where_it_was():
-    positions = filled((False, True, False), 100, 60, Hold(SKELETON))
+    positions = filled((False, True, False), 100, 60, LostTrackerFiller(SKELETON))
     np.testing.assert_array_equal(positions[:, [0, 2]], PERSON.positions[:, [0, 2]])
     seen = [
-        rotation_about_vertical(-heading_of(PERSON.rotations[i, 0])) @ (positions[i, 1] - positions[i, 0])
+        make_vertical_rotation(-compute_heading(PERSON.rotations[i, 0])) @ (positions[i, 1] - positions[i, 0])
         for i in range(99, 160)
     ]
     np.testing.assert_allclose(seen, np.tile(seen[0], (61, 1)), atol=1e-9)
-    positions = filled((True, False, False), 100, 60, Hold(SKELETON))
+    positions = filled((True, False, False), 100, 60, LostTrackerFiller(SKELETON))
     np.testing.assert_array_equal(positions[100:160, 0], np.tile(PERSON.positions[99, 0], (60, 1)))
 
 
 def test_a_heading_is_the_t_poses():
     for heading in (-3.0, -1.0, 0.0, 2.5):
-        pose = t_pose(SKELETON, np.zeros(3), heading)
-        assert heading_of(pose.rotations[0]) == pytest.approx(heading)
+        pose = make_t_pose(SKELETON, np.zeros(3), heading)
+        assert compute_heading(pose.rotations[0]) == pytest.approx(heading)
         left = pose.positions[1] - pose.positions[2]
         assert np.arctan2(left[1], left[0]) == pytest.approx(heading)
 
 
 def test_features_are_those_of_training():
-    features, sparse = Features(), np.zeros(SPARSE_DIM, np.float32)
+    features, sparse = FeatureWriter(), np.zeros(SPARSE_DIM, np.float32)
     for index, sample in enumerate(SAMPLES):
         features.write(sample, sparse)
         if index:

@@ -15,15 +15,15 @@ import wearer
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.deploy.opsets import OPSETS, convert
+from memmlp.deploy.opsets import OPSETS, convert_opset
 from memmlp.deploy.parity import TOLERANCE
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.trackers_to_body_graph import (
+    convert_to_quaternions,
     export_full,
-    full_differences,
-    quaternions,
+    measure_full_differences,
 )
 from memmlp.motion.geometry import axis_angle_to_matrix
 from memmlp.networks.streaming import streaming
@@ -60,8 +60,11 @@ def test_it_is_the_stream(name, folder: Path, step_files):
     network = exported.NETWORKS[kind]()
     if not file.exists():
         export_full(network, file, RUN, name)
-    assert full_differences(network, file, PERSON.frames, name).max() <= TOLERANCE
-    positions, rotations = space.positions_out(PERSON.positions), space.rotations_out(PERSON.rotations)
+    assert measure_full_differences(network, file, PERSON.frames, name).max() <= TOLERANCE
+    positions, rotations = (
+        space.convert_positions_from_amass(PERSON.positions),
+        space.convert_rotations_from_amass(PERSON.rotations),
+    )
     poses = wearer.play(Stream(step_files(kind), space=name), positions, rotations)
     full = OnnxStream(file)
     for _ in range(2):
@@ -80,15 +83,15 @@ def test_a_baseline_has_it_too(tmp_path: Path):
     native = onnx.load(file)
     assert exported.data_dependent(native.graph) == set()
     for opset in (15, OPSETS[-1]):
-        onnx.save(convert(native, opset), file)
-        assert full_differences(network, file, PERSON.frames[:30], "unity").max() <= TOLERANCE
+        onnx.save(convert_opset(native, opset), file)
+        assert measure_full_differences(network, file, PERSON.frames[:30], "unity").max() <= TOLERANCE
 
 
 def test_quaternions_come_out_on_demand(folder: Path):
     """They are those of the live stream, up to the sign."""
     file, network = folder / "quaternion.onnx", exported.NETWORKS["no_memory"]()
     export_full(streaming(network), file, RUN, "openxr", "quaternion", opset=15)
-    assert full_differences(network, file, PERSON.frames, "openxr").max() <= TOLERANCE
+    assert measure_full_differences(network, file, PERSON.frames, "openxr").max() <= TOLERANCE
     graph = onnx.load(file)
     onnx.checker.check_model(graph, full_check=True)
     (output,) = (output for output in graph.graph.output if output.name == "rotations")
@@ -97,7 +100,10 @@ def test_quaternions_come_out_on_demand(folder: Path):
     assert exported.data_dependent(graph.graph) == set()
     matrices, quaternion = OnnxStream(folder / "openxr.onnx"), OnnxStream(file)
     space = SPACES["openxr"]
-    trackers = space.positions_out(PERSON.positions), space.rotations_out(PERSON.rotations)
+    trackers = (
+        space.convert_positions_from_amass(PERSON.positions),
+        space.convert_rotations_from_amass(PERSON.rotations),
+    )
     for frame in range(20):
         given = [part[frame : frame + 1].astype(np.float32) for part in trackers]
         expected = matrix_to_quaternion(matrices.step(*given)[0][0].astype(np.float64))
@@ -112,7 +118,7 @@ def test_quaternions_are_exact_at_every_angle():
     small = np.logspace(-12, -1, 200)
     angles = np.concatenate([np.linspace(0, np.pi, 200), small, np.pi - small])
     matrices = axis_angle_to_matrix(torch.tensor(axes * angles[:, None]))
-    found = quaternions(matrices).numpy()
+    found = convert_to_quaternions(matrices).numpy()
     expected = matrix_to_quaternion(matrices.numpy())
     same = np.minimum(np.abs(found - expected).max(1), np.abs(found + expected).max(1))
     assert same.max() < 1e-14
@@ -121,11 +127,11 @@ def test_quaternions_are_exact_at_every_angle():
 
 def test_parity_sees_a_difference(network, folder: Path):
     file = folder / "unity.onnx"
-    assert full_differences(network, file, PERSON.frames, "openxr").max() > TOLERANCE
+    assert measure_full_differences(network, file, PERSON.frames, "openxr").max() > TOLERANCE
     other = copy.deepcopy(network)
     with torch.no_grad():
         other.stem.bias += 0.1
-    assert full_differences(other, file, PERSON.frames, "unity").max() > TOLERANCE
+    assert measure_full_differences(other, file, PERSON.frames, "unity").max() > TOLERANCE
 
 
 def test_interface_and_metadata(folder: Path):

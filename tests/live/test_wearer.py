@@ -15,15 +15,15 @@ from memmlp.live.rotations import BodyTree, matrix_to_quaternion, quaternion_to_
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.tracker_input import SampleWarning
-from memmlp.live.tracker_resampling import t_pose
+from memmlp.live.tracker_resampling import make_t_pose
 from memmlp.live.wearer import (
     Calibration,
     Offsets,
     check_offsets,
+    compute_body_height,
     make_wearer,
     read_calibration,
     save_calibration,
-    stature,
 )
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 
@@ -40,11 +40,11 @@ def file(step_files: Callable[[str], Path]) -> Path:
 
 
 def test_the_floor_comes_to_zero():
-    assert stature(BODY) == pytest.approx(1.72)
+    assert compute_body_height(BODY) == pytest.approx(1.72)
     assert make_wearer(BODY).scale == 1
     tall = make_wearer(BODY, 2.0, 0.3)
     standing = np.array([[0.5, -0.25, 0.3], [0.0, 0.0, 2.3]])  # on the floor, and the top of the head
-    np.testing.assert_allclose(tall.positions_in(standing)[:, 2], [0, 1.72], atol=1e-12)
+    np.testing.assert_allclose(tall.scale_to_network(standing)[:, 2], [0, 1.72], atol=1e-12)
 
 
 def test_impossible_heights_and_floors_are_refused():
@@ -63,18 +63,18 @@ def test_a_tall_wearer_on_a_raised_floor_moves_as_the_network_s_body(name: str, 
     space = SPACES[name]
 
     def there(positions: np.ndarray) -> np.ndarray:
-        return space.positions_out(positions * SIZE + [0, 0, FLOOR])
+        return space.convert_positions_from_amass(positions * SIZE + [0, 0, FLOOR])
 
     plain = moving.play(Stream(file), PERSON.positions, PERSON.rotations)
     tall = Stream(file, space=name, rotations="quaternion", height=HEIGHT, floor=FLOOR)
-    turns = matrix_to_quaternion(space.rotations_out(PERSON.rotations).reshape(-1, 3, 3))
+    turns = matrix_to_quaternion(space.convert_rotations_from_amass(PERSON.rotations).reshape(-1, 3, 3))
     poses = moving.play(tall, there(PERSON.positions), turns.reshape(-1, 3, 4))
     for here, pose in zip(plain, poses, strict=True):
         np.testing.assert_allclose(pose.positions, there(here.positions), atol=1e-4)
         np.testing.assert_allclose(pose.position_branch, there(here.position_branch), atol=1e-4)
         assert pose.rotations.shape == (22, 4)
         np.testing.assert_allclose(
-            quaternion_to_matrix(pose.rotations), space.pose_out(here.rotations), atol=1e-4
+            quaternion_to_matrix(pose.rotations), space.convert_pose_from_amass(here.rotations), atol=1e-4
         )
     np.testing.assert_allclose(tall.rest, builtin_rest_joints() * SIZE)
 
@@ -99,14 +99,14 @@ def test_another_height_restarts_the_stream_and_forgets_offsets_with_a_warning(f
 @pytest.mark.slow
 def test_calibration_is_in_metres_of_the_wearer(file: Path):
     """Devices exactly on the joints of a tall person in T-pose have no offsets; without a height they do."""
-    pose = t_pose(BODY, np.array([0.3, 0.2, 1.6]), 0.7)
+    pose = make_t_pose(BODY, np.array([0.3, 0.2, 1.6]), 0.7)
     devices = list(zip(pose.positions * SIZE + [0, 0, FLOOR], pose.rotations, strict=True))
     fitted = Stream(file, height=HEIGHT, floor=FLOOR).calibrate(*devices)
     assert np.abs(fitted.positions).max() < 1e-6
     assert np.abs(fitted.rotations - np.eye(3)).max() < 1e-6
     assert np.abs(Stream(file).calibrate(*devices).positions).max() > 0.05
     # After calibration a T-pose has the tall body's hands, whatever the devices.
-    pose = t_pose(BODY, np.array([0.0, 0.0, 1.58]), 0.0)
+    pose = make_t_pose(BODY, np.array([0.0, 0.0, 1.58]), 0.0)
     joints = pose.positions * SIZE
     away = np.array([[0, -0.09, 0.05], [0.06, 0, 0], [-0.06, 0, 0]])
     devices = list(zip(joints + away, pose.rotations, strict=True))

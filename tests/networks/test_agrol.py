@@ -15,7 +15,10 @@ SPARSE = CLIP[None, :, :SPARSE_DIM]
 def test_agrol_windows_see_nothing_of_other_windows():
     model, changed = tiny.baseline("agrol_mlp"), CLIP.clone()
     changed[:7] += 0.5
-    before, after = evaluation.window(model, [CLIP])[0], evaluation.window(model, [changed])[0]
+    before, after = (
+        evaluation.predict_windows(model, [CLIP])[0],
+        evaluation.predict_windows(model, [changed])[0],
+    )
     assert torch.equal(before[7:], after[7:])
     assert not torch.allclose(before[6], after[6])
 

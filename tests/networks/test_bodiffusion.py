@@ -68,7 +68,7 @@ def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypat
 def test_offline_it_is_no_stream():
     model, clip, changed = tiny.baseline("bodiffusion", offline=True), CLIP[:14], CLIP[:14].clone()
     changed[-1] += 0.5
-    before, after = (modes.window(model, [one])[0] for one in (clip, changed))
+    before, after = (modes.predict_windows(model, [one])[0] for one in (clip, changed))
     assert not torch.allclose(before[4], after[4])  # the windows in between carry it there
     assert not model.is_stream
     assert not has_stream(model)

@@ -10,8 +10,8 @@ import torch
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
-from memmlp.deploy.lower_precision import lower
-from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.deploy.lower_precision import write_lower_precision
+from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.evaluation import modes
 from memmlp.motion.body import HEAD, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.geometry import sixd_to_matrix
@@ -37,7 +37,7 @@ def rotations(motion: torch.Tensor) -> torch.Tensor:
 
 @torch.no_grad()
 def test_the_pose_is_the_same_and_the_head_where_its_tracker_is(model: ConstantPose):
-    (motion,) = modes.stream(model, [CLIP])
+    (motion,) = modes.predict_stream(model, [CLIP])
     local = rotations(motion)
     torch.testing.assert_close(local[:, 1:], local[:1, 1:].expand(len(CLIP), -1, -1, -1))
     head = motion[:, POSITION].unflatten(-1, (22, 3))[:, HEAD]
@@ -58,7 +58,7 @@ def test_its_first_gradient_is_that_of_rotations(normalize: bool):
 @torch.no_grad()
 def test_it_turns_with_the_head_and_with_nothing_else(model: ConstantPose):
     """The root's turns are about the vertical, and those of the head's heading."""
-    (motion,) = modes.stream(model, [CLIP])
+    (motion,) = modes.predict_stream(model, [CLIP])
     root = rotations(motion)[:, 0]
     turns = root @ root[0].T
     torch.testing.assert_close(
@@ -76,7 +76,7 @@ def test_its_file_is_the_network_and_has_nothing_in_a_lower_precision(
 ):
     path, stream = tmp_path / "step.onnx", streaming(model)
     export(stream, path, "0123456789abcdef")
-    assert parity(model, path, CLIP) <= TOLERANCE
+    assert measure_largest_difference(model, path, CLIP) <= TOLERANCE
     with pytest.raises(InputError, match=r"export\.precision"):
-        lower(precision, path, tmp_path / "lower.onnx", stream, [CLIP])
+        write_lower_precision(precision, path, tmp_path / "lower.onnx", stream, [CLIP])
     assert {file.name for file in tmp_path.iterdir()} == {"step.onnx"}

@@ -4,7 +4,7 @@ import pytest
 import tiny
 import torch
 
-from memmlp.evaluation.modes import window
+from memmlp.evaluation.modes import predict_windows
 from memmlp.motion.body import MOTION_DIM, SPARSE_DIM, builtin_rest_joints
 from memmlp.motion.dataset import WindowSampler
 from memmlp.motion.network_coordinates import HeadRelative
@@ -84,7 +84,7 @@ def test_in_window_mode_a_memory_recalls_what_it_was_trained_on(shift, back):
     """That is the window that ends `shift` before the newest frame of each one, as in teacher forcing."""
     model, clip, seen = tiny.model(CodeMemory, shift=shift), tiny.clip(24), []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1].sparse))
-    found, size = window(model, [clip])[0], model.frames
+    found, size = predict_windows(model, [clip])[0], model.frames
     encoded = model.normalizer.encode(clip)[None, :, :SPARSE_DIM]
     kept = seen[size - 1 :: size] if shift == "frame" else seen
     for t, past in zip(range(size - 1, 24, size), kept, strict=False):

@@ -15,7 +15,7 @@ from memmlp.common.components import find_component
 from memmlp.common.errors import InputError
 from memmlp.deploy.latency import count_macs
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.deploy.parity import parity
+from memmlp.deploy.parity import measure_largest_difference
 from memmlp.evaluation import modes
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
@@ -68,13 +68,13 @@ SPARSE = LONG[None, :, :SPARSE_DIM]
 def test_calls_modes_clips_and_the_graph_are_one_stream(name: str):
     """In float64: untrained networks on their own output may amplify float32's rounding."""
     model = NETWORKS[name]().double()
-    stream = modes.stream(model, [LONG])[0]
+    stream = modes.predict_stream(model, [LONG])[0]
     assert stream.shape == (20, MOTION_DIM)
-    together = modes.stream(model, [SHORT, LONG])
+    together = modes.predict_stream(model, [SHORT, LONG])
     torch.testing.assert_close(together[1], stream, atol=1e-9, rtol=0)
-    torch.testing.assert_close(together[0], modes.stream(model, [SHORT])[0], atol=1e-9, rtol=0)
-    windows = modes.window(model, [SHORT, LONG])
-    torch.testing.assert_close(windows[0], modes.window(model, [SHORT])[0], atol=1e-9, rtol=0)
+    torch.testing.assert_close(together[0], modes.predict_stream(model, [SHORT])[0], atol=1e-9, rtol=0)
+    windows = modes.predict_windows(model, [SHORT, LONG])
+    torch.testing.assert_close(windows[0], modes.predict_windows(model, [SHORT])[0], atol=1e-9, rtol=0)
     if "position" not in model.branches:
         expected = model.normalizer.pose(stream, LONG[:, :SPARSE_DIM]).flatten(1)
         torch.testing.assert_close(stream[:, ROTATION.stop :], expected, atol=1e-9, rtol=0)
@@ -126,5 +126,10 @@ def test_a_network_without_a_streaming_graph_is_refused():
 @pytest.mark.parametrize("network", [*exported.NETWORKS, *exported.LARGEST])
 def test_its_file_is_the_network_in_onnx_runtime(step_files: Callable[[str], Path], network: str):
     path = step_files(network)
-    assert parity((exported.NETWORKS | exported.LARGEST)[network](), path, tiny.clip(40)[:20]) < 1e-4
+    assert (
+        measure_largest_difference(
+            (exported.NETWORKS | exported.LARGEST)[network](), path, tiny.clip(40)[:20]
+        )
+        < 1e-4
+    )
     assert "state.count" in OnnxStream(path).state

@@ -8,8 +8,8 @@ import torch
 
 from memmlp.config.build import untrained
 from memmlp.deploy.export import export
-from memmlp.deploy.lower_precision import lower
-from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.deploy.lower_precision import write_lower_precision
+from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
@@ -63,7 +63,7 @@ def test_a_global_head_begins_at_the_mean_pose():
     model.members["member1"].head.weight.zero_()
     mean = model.normalizer.posed(torch.zeros(1, ROTATION.stop), SPARSE[0, :1])
     made = model.pose(model.members["member1"].head(torch.zeros(1, 16)), SPARSE[0, :1])
-    found, expected = (evaluation.local_rotations(motion) for motion in (made, mean))
+    found, expected = (evaluation.extract_rotations(motion) for motion in (made, mean))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
@@ -103,8 +103,8 @@ def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
     )
     stream = streaming(model)
     export(stream, exact, "0" * 16)
-    assert parity(model, exact, CLIP) <= TOLERANCE
-    lower("int8", exact, int8, stream, [CLIP[:20]])
+    assert measure_largest_difference(model, exact, CLIP) <= TOLERANCE
+    write_lower_precision("int8", exact, int8, stream, [CLIP[:20]])
     graph = onnx.load(int8).graph
     types = {tensor.name: tensor.data_type for tensor in graph.initializer}
     given = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}

@@ -9,7 +9,7 @@ import torch
 from memmlp.config.build import untrained
 from memmlp.evaluation import modes
 from memmlp.evaluation.ik import Arms
-from memmlp.evaluation.modes import joint_positions
+from memmlp.evaluation.modes import extract_positions
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.refiner import Refined
@@ -39,23 +39,23 @@ def test_it_has_the_published_size(name):
 def test_it_corrects_the_networks_stream(name):
     """Computed here by torch's own recurrent layers over the whole stream, frame after frame."""
     model = network(name)
-    bare, made = (modes.stream(one, [CLIP])[0] for one in (model.network, model))
+    bare, made = (modes.predict_stream(one, [CLIP])[0] for one in (model.network, model))
     expected = bare[:, ROTATION] + model.head(model.layers(bare[None, :, ROTATION])[0])[0]
     torch.testing.assert_close(made[:, ROTATION], expected)
     assert not torch.allclose(made[:, ROTATION], bare[:, ROTATION], atol=1e-3)
     positions = model.normalizer.pose(made, SPARSE[0]).flatten(1) if name != "mem_mlp" else bare[:, POSITION]
     torch.testing.assert_close(made[:, POSITION], positions)
-    assert torch.equal(modes.window(model, [CLIP])[0], made)
+    assert torch.equal(modes.predict_windows(model, [CLIP])[0], made)
 
 
 @torch.no_grad()
 def test_arms_that_it_moves_off_their_trackers_reach_again_by_inverse_kinematics():
     """The trackers are where the network's own hands are, so that its arms reach them."""
     model, clip = tiny.refined(tiny.recurrent_poser(Heading(), output="reaching")), tiny.clip(9)
-    (first,) = modes.stream(model.network, [clip])
-    hands = joint_positions(first)[:, list(HANDS)]
+    (first,) = modes.predict_stream(model.network, [clip])
+    hands = extract_positions(first)[:, list(HANDS)]
     clip[:, SPARSE_POSITION.start + 3 : SPARSE_POSITION.stop] = hands.flatten(1)
-    (reaching,), (moved,) = modes.stream(model.network, [clip]), modes.stream(model, [clip])
+    (reaching,), (moved,) = modes.predict_stream(model.network, [clip]), modes.predict_stream(model, [clip])
     again = Arms().solutions(model.normalizer, moved, clip[:, :SPARSE_DIM])["combined"]
     found = [model.normalizer.pose(motion, clip[:, :SPARSE_DIM]) for motion in (reaching, again, moved)]
     away = [float((joints[:, list(HANDS)] - hands).norm(dim=-1).mean()) for joints in found]

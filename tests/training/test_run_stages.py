@@ -143,7 +143,9 @@ def seed_of(run: Run) -> list[str]:
 
 def test_a_nan_is_not_exported(home, memmlp, monkeypatch):
     monkeypatch.chdir(home)
-    monkeypatch.setattr("memmlp.deploy.parity.differences", lambda *_: torch.tensor([1e-6, float("nan")]))
+    monkeypatch.setattr(
+        "memmlp.deploy.parity.measure_differences", lambda *_: torch.tensor([1e-6, float("nan")])
+    )
     monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run, opset: path.write_bytes(b""))
     monkeypatch.setattr(MotionDataset, "clips", lambda self: [torch.zeros(2, 252)])
     ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--opset", "17")

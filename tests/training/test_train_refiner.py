@@ -30,7 +30,9 @@ def test_pieces_are_of_the_training_clips_and_the_network_streams_through_each()
     for piece, clip, motion in zip(one.frames, one.clips, one.streamed, strict=True):
         known = dataset.clip(int(clip)).unfold(0, 20, 1).transpose(1, 2)
         assert (known == piece).flatten(1).all(1).any()
-        torch.testing.assert_close(motion, modes.stream(one.model.network, [piece])[0], atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            motion, modes.predict_stream(one.model.network, [piece])[0], atol=1e-5, rtol=0
+        )
 
 
 def test_a_step_compares_the_corrected_pieces_and_reaches_the_refiner_alone():
@@ -43,7 +45,7 @@ def test_a_step_compares_the_corrected_pieces_and_reaches_the_refiner_alone():
     assert slopes == {f"{part}.{name}" for part, weights in parts for name, _ in weights}
     torch.manual_seed(3)
     drawn = torch.randint(6, (4,))
-    motion = modes.stream(one.model, list(one.frames[drawn]))
+    motion = modes.predict_stream(one.model, list(one.frames[drawn]))
     true = one.frames[drawn]
     terms = one.loss.terms(
         torch.stack(motion), true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], one.model.normalizer

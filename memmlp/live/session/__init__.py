@@ -1,1 +1,1 @@
-"""`memmlp live`: a network fed by a clip or by live trackers, watched on a local page."""
+"""`memmlp live`: run a network on a clip or live trackers, and show the motion on a local page."""

@@ -1,8 +1,7 @@
-"""The loop of `memmlp live`: samples go from a source through the stream to outputs and to open pages.
+"""The loop of `memmlp live`: it reads samples, runs the stream, and sends poses to outputs and pages.
 
-Between the samples it carries out the page's orders, which fit the stream to its wearer. They arrive in the
-server's threads. The wearer has to walk away from the keyboard before a calibration, so it waits for a
-countdown.
+Between samples, it executes orders from the page, which adjust the stream to the user. Orders arrive in the
+server's threads. A calibration starts after a countdown, so the user can leave the keyboard.
 """
 
 from __future__ import annotations
@@ -22,18 +21,18 @@ from memmlp.live.outputs import Outputs
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.session.sources import QuaternionPoses, TrackerSource
 from memmlp.live.spaces import SPACES, SpaceName
-from memmlp.live.stream import FORGOTTEN, BodyFrame, Stream, raise_by
+from memmlp.live.stream import FORGOTTEN, BodyFrame, Stream, move_up
 from memmlp.live.tracker_input import OddSamples
 from memmlp.live.wearer import Calibration, save_calibration
 from memmlp.motion.body import FPS, JOINTS, PARENTS, ROOT
 from memmlp.motion.formats.gltf import VRM_BONES
 from memmlp.motion.limb_shapes import HEAT, LIMBS
 
-PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js
-TOP = 20  # cm at the top of the page's colour scale
-UNIT = 10_000  # whole numbers that a quaternion's 1 is sent as
+PAGE_SPACE = SPACES["openxr"]  # three.js uses the same axes
+TOP = 20  # maximum of the page's colour scale, cm
+UNIT = 10_000  # quaternions are multiplied by this number and sent as integers
 COUNTDOWN = 5.0  # seconds
-LONGEST = 60.0  # seconds of a countdown
+LONGEST = 60.0  # maximum countdown, seconds
 ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
 
 Publish = Callable[[dict[str, Any]], None]
@@ -47,14 +46,14 @@ def make_greeting(
     remark: str = "",
     avatar: bool = False,
 ) -> dict[str, Any]:
-    """Return the message that a page gets before the first frame.
+    """Return the first message to a page.
 
     Args:
-        source: where the trackers' samples come from.
+        source: the source of samples.
         network: the network's name.
         outputs: the other receivers of poses.
-        remark: a warning about the network, such as that it is hardly trained.
-        avatar: whether the page shows an avatar, whose bones it needs.
+        remark: a warning about the network, such as too little training.
+        avatar: whether the page shows an avatar. If True, the message contains its bones.
     """
     return {
         "network": network,
@@ -66,7 +65,7 @@ def make_greeting(
         "limbs": [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS],
         "heat": HEAT,
         "top": TOP,
-        "worn": source.worn,
+        "worn": source.has_wearer,
         **({"avatar": {"bones": VRM_BONES, "parents": PARENTS, "unit": UNIT}} if avatar else {}),
     }
 
@@ -81,17 +80,17 @@ def run_loop(
     avatar: bool = False,
     report: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Feed samples to the stream, and its frames to the outputs and to open pages, until `stopped` is set.
+    """Run the stream on samples, and send the frames to outputs and open pages, until `stopped` is set.
 
     Args:
-        stream: the stream of poses; its network is `stream.network`.
-        source: gives the samples.
-        publish: gets the messages (`frame_message`); for a malformed sample, the counts alone.
+        stream: the stream.
+        source: the source of samples.
+        publish: gets the messages (`make_frame_message`). For a malformed sample, it gets only the counts.
         stopped: ends the loop.
-        outputs: get the frames first.
-        fitting: fits the stream to its wearer between the samples.
-        avatar: whether messages include the avatar's pose (`avatar_message`).
-        report: gets a line if samples are odd (`OddSamples`), and for the first malformed sample.
+        outputs: the outputs; they get each frame before the pages.
+        fitting: executes the page's orders between samples.
+        avatar: whether messages include the avatar's pose (`make_avatar_message`).
+        report: gets a line about odd samples (`OddSamples`) and about the first malformed sample.
     """
     stream.odd = OddSamples(report)
     number, counts = 0, {"dropped": 0, "malformed": 0}
@@ -107,7 +106,7 @@ def run_loop(
         except InputError as error:
             counts["malformed"] += 1
             if counts["malformed"] == 1:
-                report(f"a sample is rejected: {error}")
+                report(f"a sample was rejected ({error})")
             publish(dict(counts))
             continue
         if not frame.fresh:
@@ -115,44 +114,49 @@ def run_loop(
         if outputs:
             outputs.take(frame)
         whole = 1000 * (time.perf_counter() - sample.arrived)
-        message = {"number": number, **frame_message(stream, frame, source.truth(frame.time))}
+        message = {"number": number, **make_frame_message(stream, frame, source.get_true_joints(frame.time))}
         message |= {"whole": round(whole, 3), **counts}
-        publish(message | (avatar_message(frame) if avatar else {}))
+        publish(message | (make_avatar_message(frame) if avatar else {}))
         number += 1
 
 
-def frame_message(stream: Stream, frame: BodyFrame, truth: np.ndarray | None) -> dict[str, Any]:
-    """Return the message about a stream's newest frame, without its number and the loop's counts.
+def make_frame_message(stream: Stream, frame: BodyFrame, truth: np.ndarray | None) -> dict[str, Any]:
+    """Return the message about a stream's newest frame.
 
-    It has the frame's time (s), the held trackers, whether the samples' times jump (`OddSamples`), the
-    milliseconds that the exported step took (`ms`), and the joints' positions, predicted and true (66 whole
-    millimetres each, in openxr's axes). The loop adds the milliseconds from the sample's arrival until all
-    outputs had the pose (`whole`).
+    - `time`: the frame's time, seconds.
+    - `held`: the held trackers.
+    - `jumping`: whether the samples' times jump (`OddSamples`).
+    - `ms`: the computation time of the network, milliseconds.
+    - `positions`, `truth`: predicted and true joints, each 66 integers in millimetres and openxr axes.
+
+    The loop adds the frame number, the counts, and `whole`: the milliseconds from the sample's arrival until
+    all outputs have the pose.
     """
     return {
         "time": round(frame.time, 4),
         "held": frame.held,
         "jumping": stream.odd.jumping,
         "ms": round(1000 * stream.step_seconds, 3),
-        "positions": to_millimetres(raise_by(frame.positions, stream.wearer.floor)),
-        "truth": to_millimetres(truth),
+        "positions": convert_to_millimetres(move_up(frame.positions, stream.wearer.floor)),
+        "truth": convert_to_millimetres(truth),
     }
 
 
-def to_millimetres(joints: np.ndarray | None) -> list[int] | None:
-    """Return joints (22, 3), metres, AMASS' world, as a flat list of millimetres in the page's axes."""
+def convert_to_millimetres(joints: np.ndarray | None) -> list[int] | None:
+    """Convert joints (22, 3), metres, AMASS' world, to a flat list of millimetres in the page's axes."""
     if joints is None:
         return None
-    positions = PAGE_SPACE.positions_out(np.asarray(joints, np.float64))
+    positions = PAGE_SPACE.convert_positions_from_amass(np.asarray(joints, np.float64))
     return (1000 * positions).round().astype(int).ravel().tolist()
 
 
-def avatar_message(frame: BodyFrame) -> dict[str, Any]:
-    """Return the part of a message for an avatar: the joints' rotations, and the wearer's hips, metres.
+def make_avatar_message(frame: BodyFrame) -> dict[str, Any]:
+    """Return the message fields for an avatar.
 
-    The rotations are 22 quaternions xyzw as 88 whole numbers, relative to VRM's T-pose, which is SMPL's: Y
-    up, facing +Z. The root's is in the page's axes. The height of the hips in the rest pose, metres, gives
-    the avatar its size; the wearer may change it on the page at any time.
+    - `turns`: joint rotations, 22 quaternions xyzw as 88 integers. They are relative to VRM's T-pose, which
+      is also SMPL's: Y up, facing +Z. The root rotation is in the page's axes.
+    - `hips`: the height of the hips in the rest pose, metres. It determines the avatar's size. The user can
+      change it on the page at any time.
     """
     local = frame.local.copy()
     local[0] = PAGE_SPACE.world.T @ local[0]
@@ -166,7 +170,7 @@ class Order(NamedTuple):
 
     Attributes:
         action: one of ACTIONS.
-        value: metres for height and floor; seconds of the countdown for calibrate and touch_floor.
+        value: metres for height and floor; the countdown in seconds for calibrate and touch_floor.
     """
 
     action: str
@@ -174,7 +178,7 @@ class Order(NamedTuple):
 
 
 def read_order(fields: object) -> Order:
-    """Read an order: {"action": ..., "value": ...}. Raises InputError for any other."""
+    """Parse an order {"action": ..., "value": ...}. Raises InputError for invalid fields."""
     if not isinstance(fields, dict) or fields.get("action") not in ACTIONS:
         raise InputError(f"action: must be one of {', '.join(ACTIONS)}")
     value = fields.get("value")
@@ -185,13 +189,13 @@ def read_order(fields: object) -> Order:
 
 
 class Fitting:
-    """Fits a stream to its wearer by orders: body height, floor, calibration in a T-pose.
+    """Executes orders that adjust a stream to its user: body height, floor, and calibration in a T-pose.
 
     Args:
         stream: the stream.
         space: the stream's frame of reference.
-        path: the file to which each change is saved; None to save nothing.
-        publish_state: gets "wearer" and the state whenever the state changes.
+        path: the calibration file, updated after each change; None for no file.
+        publish_state: gets "wearer" and the new state after each change.
         clock: returns the time, seconds.
     """
 
@@ -211,15 +215,15 @@ class Fitting:
         self.height: float | None = None if stream.wearer.scale == 1 else stream.wearer.height
         self._publish_state("")
 
-    def ask(self, fields: object) -> None:
-        """Take an order, from any thread. Raises InputError if it is not a valid order."""
+    def submit_order(self, fields: object) -> None:
+        """Queue an order, from any thread. Raises InputError for an invalid order."""
         self.orders.put(read_order(fields))
 
     def step(self, trackers: QuaternionPoses | None) -> None:
-        """Carry out the orders that are due: new ones at once, and a waiting one after its countdown.
+        """Execute new orders, and the waiting order after its countdown.
 
         Args:
-            trackers: the devices' current poses; None if no sample came.
+            trackers: the current poses of the devices; None without a sample.
         """
         while not self.orders.empty():
             order = self.orders.get()
@@ -235,7 +239,7 @@ class Fitting:
             self._carry_out(order, trackers)
 
     def _carry_out(self, order: Order, trackers: QuaternionPoses | None) -> None:
-        """Carry out an order, save what it changed, and publish the result."""
+        """Execute an order, save the calibration, and publish the result."""
         try:
             line = self._change(order, trackers)
             if self.path is not None and order.action != "cancel":
@@ -248,13 +252,13 @@ class Fitting:
             self._publish_state(line)
 
     def _change(self, order: Order, trackers: QuaternionPoses | None) -> str:
-        """Change the stream by an order, and return a line about the result."""
+        """Apply an order to the stream, and return a line about the result."""
         stream, value = self.stream, order.value
         if order.action == "calibrate" and trackers:
             offsets = stream.calibrate(*trackers)
             farthest = 100 * offsets.distances.max()
             line = f"Calibrated; the devices are up to {farthest:.0f} cm from the joints."
-            return f"{line} But {offsets.doubt}" if offsets.doubt else line
+            return f"{line} Warning: {offsets.tilt_warning}" if offsets.tilt_warning else line
         if order.action == "height":
             calibrated = stream.offsets is not None
             stream.fit(value, stream.wearer.floor)
@@ -263,15 +267,15 @@ class Fitting:
         if order.action == "touch_floor" and trackers:
             hands = [tracker[0] for tracker in trackers[1:] if tracker is not None]
             if not hands:
-                raise InputError("floor: no hand is tracked; touch the floor with one")
-            value = round(min(float(stream.space.positions_in(hand)[2]) for hand in hands), 4)
+                raise InputError("floor: no hand is tracked; touch the floor with a tracked hand")
+            value = round(min(float(stream.space.convert_positions_to_amass(hand)[2]) for hand in hands), 4)
         if order.action in ("floor", "touch_floor"):
             stream.fit(self.height, value or 0.0)
             return f"The floor is at {100 * (value or 0.0):.0f} cm."
         if order.action == "forget":
             stream.offsets = None
             stream.reset()
-            return "The calibration is forgotten."
+            return "The calibration was removed."
         return ""  # cancel
 
     def _publish_state(self, line: str, failed: bool = False) -> None:

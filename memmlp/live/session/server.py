@@ -1,6 +1,6 @@
-"""The server of the live page: files, frames as server-sent events, and orders from the page.
+"""The server of the live page. It sends files and frames (server-sent events), and receives orders.
 
-Pages may be opened and closed at any time; a slow page misses frames, and does not delay the others.
+Pages may be opened and closed at any time. A slow page misses frames, but does not delay other pages.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from memmlp.common.errors import InputError, describe_read_error
 from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, find_content_type, read_page_file
 from memmlp.motion.formats.gltf import write_vrm
 
-QUEUED = 240  # the most frames that wait for a page; beyond, the oldest are dropped
-QUIET = 2.0  # seconds without a frame after which a comment shows that the connection lives
-LARGEST = 1000  # bytes of an order
+QUEUED = 240  # maximum number of queued frames for a page; older frames are dropped
+QUIET = 2.0  # seconds without a frame before a comment keeps the connection alive
+LARGEST = 1000  # maximum number of bytes of an order
 PAGE = (
     "index.html", "style.css", "main.js", "stage.js", "history.js", "wearer.js", "avatar.js",
     "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
@@ -37,13 +37,15 @@ AVATAR_SCRIPTS = {
 EXTENSIONS = ("VRMC_vrm", "VRM")  # of VRM 1.0, and 0.x
 
 
-def read_files(vrm: bytes | None = None) -> dict[str, bytes]:
-    """Return the files of the page by name, with a VRM avatar and three-vrm if there is an avatar.
+def load_page_files(vrm: bytes | None = None) -> dict[str, bytes]:
+    """Return the files of the page by name.
 
-    With an avatar, the page's three.js is replaced by that of the npm package to which the loader belongs.
+    Args:
+        vrm: a VRM avatar. If given, the files include the avatar and three-vrm, and three.js comes from its
+        npm package, which also contains the loader.
 
     Raises:
-        InputError: if an npm package can't be downloaded.
+        InputError: if an npm package cannot be downloaded.
     """
     files = {name: read_page_file("memmlp.live.session", name) for name in PAGE}
     if vrm is None:
@@ -57,8 +59,8 @@ def read_files(vrm: bytes | None = None) -> dict[str, bytes]:
     return files | scripts | {"index.html": page, "avatar.vrm": vrm}
 
 
-def mannequin_vrm(rest: np.ndarray) -> bytes:
-    """Return the built-in avatar as a VRM file, with the given rest joints (22, 3), metres."""
+def make_mannequin_vrm(rest: np.ndarray) -> bytes:
+    """Return the built-in avatar as VRM content, with rest joints (22, 3), metres."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mannequin.vrm"
         write_vrm(path, rest)
@@ -66,7 +68,7 @@ def mannequin_vrm(rest: np.ndarray) -> bytes:
 
 
 def read_vrm(path: Path) -> bytes:
-    """Return a VRM file's content. Raises InputError if the file is not a VRM file."""
+    """Return the content of a VRM file. Raises InputError if it is not a VRM file."""
     try:
         content = path.read_bytes()
         if content[:4] != b"glTF":
@@ -76,40 +78,40 @@ def read_vrm(path: Path) -> bytes:
     except (OSError, ValueError, struct.error, AttributeError) as error:
         raise InputError(f"--avatar {path}: {describe_read_error(error)}; expected a VRM file") from None
     if not any(name in extensions for name in EXTENSIONS):
-        raise InputError(f"--avatar {path}: a glTF file without a VRM avatar; expected a VRM file")
+        raise InputError(f"--avatar {path}: is glTF without a VRM avatar; expected a VRM file")
     return content
 
 
 class Hub:
-    """Hands states and frames to all open pages.
+    """Sends states and frames to all open pages.
 
     Args:
-        greeting: the first state, which each page gets first.
+        greeting: the first state for each page.
     """
 
     def __init__(self, greeting: Mapping[str, Any]):
         self.changed = threading.Condition()
-        self.states: dict[str, tuple[int, bytes]] = {}  # the number and the event of each newest state
+        self.states: dict[str, tuple[int, bytes]] = {}  # number and event of the newest state, by name
         self.frames: deque[tuple[int, bytes]] = deque(maxlen=QUEUED)
         self.count, self.closed = 0, False
         self.publish_state("greeting", greeting)
 
     def publish(self, message: Mapping[str, Any]) -> None:
-        """Hand a frame's message to all current pages."""
+        """Send a frame's message to all open pages."""
         with self.changed:
             self.count += 1
-            self.frames.append((self.count, to_event("frame", message)))
+            self.frames.append((self.count, encode_event("frame", message)))
             self.changed.notify_all()
 
     def publish_state(self, name: str, state: Mapping[str, Any]) -> None:
-        """Hand a state to all current pages, and to later ones until the state changes."""
+        """Send a state to all open pages, and to later pages until the state changes."""
         with self.changed:
             self.count += 1
-            self.states[name] = self.count, to_event(name, state)
+            self.states[name] = self.count, encode_event(name, state)
             self.changed.notify_all()
 
-    def events(self) -> Iterator[bytes]:
-        """Yield the states, then all events as they come, until the hub is closed."""
+    def stream_events(self) -> Iterator[bytes]:
+        """Yield the current states, then all new events, until the hub is closed."""
         seen, frames_from = 0, self.count
         while not self.closed:
             with self.changed:
@@ -121,34 +123,34 @@ class Hub:
             yield b"".join(event for _, event in news) or b": quiet\n\n"
 
     def close(self) -> None:
-        """End the events of every page, and of each that comes later."""
+        """End the events of all current and later pages."""
         with self.changed:
             self.closed = True
             self.changed.notify_all()
 
 
-def to_event(name: str, value: Mapping[str, Any]) -> bytes:
-    """Return a server-sent event."""
+def encode_event(name: str, value: Mapping[str, Any]) -> bytes:
+    """Encode a value as a server-sent event."""
     return f"event: {name}\ndata: {json.dumps(value, separators=(',', ':'))}\n\n".encode()
 
 
 class LiveHandler(PageHandler):
-    """Answers one request of a page."""
+    """Answers one request from a page."""
 
     server: LiveServer
 
     def answer(self, path: str, query: Mapping[str, str]) -> None:
-        """Send a file of the page, or the stream of events until its end."""
+        """Send a file of the page, or the stream of events."""
         name = path or "index.html"
         if name == "events":
-            self.send_events(self.server.hub.events())
+            self.send_events(self.server.hub.stream_events())
         elif name in self.server.files:
             self.send(200, find_content_type(name), self.server.files[name])
         else:
             self.send(404, TEXT, b"not found")
 
     def do_POST(self) -> None:
-        """Take an order from the page; the answer is empty, or a line about its error."""
+        """Receive an order from the page. The answer is empty, or an error message."""
         take, code, line = self.server.take_order, 200, ""
         with contextlib.suppress(ConnectionError, TimeoutError):
             if not self.server.access.allows_change(self.path, self.headers, self.server.server_port):
@@ -165,13 +167,13 @@ class LiveHandler(PageHandler):
 
 
 class LiveServer(PageServer):
-    """Serves the page, as `PageServer` does.
+    """Serves the live page.
 
     Args:
-        hub: gives the frames to the pages.
-        port, host, token: as in `PageServer`.
-        files: the page's files, by their names.
-        take_order: takes an order from the page, or raises InputError; None to reject all orders.
+        hub: sends the frames to the pages.
+        port, host, token: see `PageServer`.
+        files: the page's files by name.
+        take_order: processes an order from the page, or raises InputError; None to reject all orders.
     """
 
     def __init__(
@@ -183,7 +185,7 @@ class LiveServer(PageServer):
         files: Mapping[str, bytes] | None = None,
         take_order: Callable[[object], None] | None = None,
     ):
-        self.hub, self.files, self.take_order = hub, files or read_files(), take_order
+        self.hub, self.files, self.take_order = hub, files or load_page_files(), take_order
         super().__init__(LiveHandler, port, host, token)
 
     def end_events(self) -> None:

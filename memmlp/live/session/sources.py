@@ -1,15 +1,15 @@
-"""Sources of tracker poses: a clip that is played, or packets that arrive at this machine.
+"""Sources of tracker poses: a recorded clip, or packets from the network.
 
 One datagram is one sample, as JSON or as an OSC bundle. A pose is seven numbers, `x y z qx qy qz qw`: metres
-and a unit quaternion. In JSON:
+and a unit quaternion. A JSON example:
 
     {"time": 12.25, "seq": 735, "head": [x, y, z, qx, qy, qz, qw], "left": null, "right": [...]}
 
-In OSC a bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right` (seven floats each),
+An OSC bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right` (seven floats each),
 `/memmlp/time` (a double or float) and `/memmlp/seq` (an integer).
 
-A tracker that is null or missing is lost. A packet without a time gets its time of arrival. By the sample's
-number, seq, missing packets are counted, and those that others have overtaken are left out.
+A tracker is lost if it is null or missing. A packet without a time gets its arrival time. `seq` is the number
+of the sample. It serves to count missing packets, and to drop packets that arrive out of order.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from memmlp.motion.body import (
 )
 
 PREFIX = "/memmlp/"
-POSE = 7  # numbers of a pose
-REPORTED = 3  # other machines that are reported
-WAIT = 0.25  # seconds that `read` waits at most
-PAUSE = 1.0  # seconds between two rounds of a clip, so long that the stream restarts
-LARGEST = 65_536  # the largest datagram, bytes
-OVERTAKEN = 20  # packets that may overtake another; a number further back is a sender that restarted
-RESTARTED = 10_000  # so many missing numbers are another sender, not lost packets
+POSE = 7  # number of values in a pose
+REPORTED = 3  # maximum number of rejected machines to report
+WAIT = 0.25  # maximum wait of `read`, seconds
+PAUSE = 1.0  # seconds between two repetitions of a clip; long enough to restart the stream
+LARGEST = 65_536  # maximum number of bytes of a datagram
+OVERTAKEN = 20  # largest backward step of `seq` for a late packet; larger steps mean a restarted sender
+RESTARTED = 10_000  # a forward step of this size means another sender instead of lost packets
 
 QuaternionPose = tuple[np.ndarray, np.ndarray] | None
 """A tracker's position (3,), metres, and quaternion xyzw (4,); None for a lost tracker."""
 QuaternionPoses = tuple[QuaternionPose, QuaternionPose, QuaternionPose]
-"""The poses of head, left and right."""
+"""The poses of head, left and right wrist."""
 
 
 class Packet(NamedTuple):
@@ -71,8 +71,8 @@ class Packet(NamedTuple):
     seq: int | None = None
 
 
-def from_json(datagram: bytes) -> Packet:
-    """Read the packet of a JSON datagram. Raises InputError for anything else."""
+def parse_json_packet(datagram: bytes) -> Packet:
+    """Parse a JSON datagram. Raises InputError if it is malformed."""
     try:
         fields = json.loads(datagram)
     except (ValueError, RecursionError):
@@ -82,16 +82,16 @@ def from_json(datagram: bytes) -> Packet:
     return read_packet(fields)
 
 
-def from_osc(datagram: bytes) -> Packet:
-    """Read the packet of an OSC bundle. Raises InputError for anything else."""
+def parse_osc_packet(datagram: bytes) -> Packet:
+    """Parse an OSC bundle. Raises InputError if it is malformed."""
     from pythonosc.osc_bundle import OscBundle
     from pythonosc.osc_message import OscMessage
 
-    logging.disable(logging.WARNING)  # the library warns of each datagram that it can't read
+    logging.disable(logging.WARNING)  # the library warns about each unreadable datagram
     try:
         parts = [part for part in OscBundle(datagram) if isinstance(part, OscMessage)]
         arguments = {part.address.removeprefix(PREFIX): list(part.params) for part in parts}
-    except Exception as error:  # the library raises many kinds over bytes that are not OSC
+    except Exception as error:  # the library raises many kinds of errors
         raise InputError(f"packet: must be an OSC bundle ({error})") from None
     finally:
         logging.disable(logging.NOTSET)
@@ -100,12 +100,12 @@ def from_osc(datagram: bytes) -> Packet:
 
 
 def read_packet(fields: Mapping[str, Any]) -> Packet:
-    """Return the packet with named values. Raises InputError if they are malformed.
+    """Make a packet from its fields. Raises InputError if a field is malformed.
 
-    Whether times and rotations are valid is checked by the stream.
+    The stream checks later whether times and rotations are valid.
     """
     if not any(name in fields for name in TRACKERS):
-        raise InputError(f"packet: must have {', '.join(TRACKERS)}")
+        raise InputError(f"packet: must have at least one of {', '.join(TRACKERS)}")
     seq = fields.get("seq")
     if seq is not None and not isinstance(seq, int):
         raise InputError("seq: must be an integer")
@@ -131,8 +131,8 @@ class SourceSample(NamedTuple):
     Attributes:
         time: seconds of the trackers' clock.
         trackers: head, left and right.
-        arrived: the time of arrival, seconds of `time.perf_counter`.
-        dropped: how many samples were lost before this one.
+        arrived: the arrival time, seconds of `time.perf_counter`.
+        dropped: number of lost samples before this sample.
     """
 
     time: float
@@ -142,33 +142,33 @@ class SourceSample(NamedTuple):
 
 
 class TrackerSource(Protocol):
-    """Gives tracker poses, one sample after the other.
+    """A source of tracker samples.
 
     Attributes:
-        name: the source's description.
-        space: the frame of reference of its poses.
-        worn: whether the poses come from a wearer's devices, so that the stream can be fitted.
+        name: the description of the source.
+        space: the frame of reference of the poses.
+        has_wearer: whether a user wears the trackers. If True, the stream can be adjusted to the user.
     """
 
     name: str
     space: SpaceName
-    worn: bool
+    has_wearer: bool
 
     def read(self) -> SourceSample | None:
-        """Return the next sample; None if none came within `WAIT` seconds.
+        """Return the next sample; None if no sample arrives within `WAIT` seconds.
 
         Raises InputError for a malformed sample.
         """
 
-    def truth(self, time: float) -> np.ndarray | None:
-        """Return the true joints (22, 3), metres, AMASS' world, at a time; None if they are unknown."""
+    def get_true_joints(self, time: float) -> np.ndarray | None:
+        """Return the true joints (22, 3), metres, AMASS' world, at a time; None if unknown."""
 
     def close(self) -> None:
-        """Release the source's resources."""
+        """Release all resources."""
 
 
 class TrackedClip:
-    """A clip, from which tracker poses and true joints can be read at any time.
+    """A clip with interpolated tracker poses and true joints.
 
     Args:
         name: the clip's name.
@@ -183,34 +183,34 @@ class TrackedClip:
         self.joints = frames[:, SPARSE_DIM : SPARSE_DIM + MOTION_DIM][:, POSITION].reshape(-1, N_JOINTS, 3)
         self.seconds = (len(frames) - 1) / FPS
 
-    def trackers(self, time: float) -> QuaternionPoses:
-        """Return position and quaternion (xyzw) of head, left and right wrist at a time, interpolated."""
-        first, _ = self._place(time)
+    def interpolate_trackers(self, time: float) -> QuaternionPoses:
+        """Return positions and quaternions (xyzw) of head, left and right wrist at a time."""
+        first, _ = self._locate(time)
         a, b = (TrackerSample(i / FPS, self.positions[i], self.rotations[i]) for i in (first, first + 1))
         sample = interpolate(a, b, time)
         head, left, right = zip(sample.positions, matrix_to_quaternion(sample.rotations), strict=True)
         return head, left, right
 
-    def truth(self, time: float) -> np.ndarray:
-        """Return the joints (22, 3), metres, world, at a time, interpolated, or at the clip's nearest end."""
-        first, weight = self._place(time)
+    def interpolate_joints(self, time: float) -> np.ndarray:
+        """Return the true joints (22, 3), metres, world, at a time, clamped to the clip's length."""
+        first, weight = self._locate(time)
         return self.joints[first] + weight * (self.joints[first + 1] - self.joints[first])
 
-    def _place(self, time: float) -> tuple[int, float]:
-        """Return the index of the frame before a time, and the fraction of the way to the next frame."""
+    def _locate(self, time: float) -> tuple[int, float]:
+        """Return the index of the frame before a time, and the interpolation weight of the next frame."""
         first = min(max(int(time * FPS), 0), len(self.joints) - 2)
         return first, min(max(time * FPS - first, 0.0), 1.0)
 
 
-def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
-    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on a network's body.
+def read_npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
+    """Read an AMASS npz, and return its frames (N, 252) at 60 Hz on a network's body.
 
     Args:
         path: the file.
-        rest: the body's joints in the rest pose (22, 3), metres, SMPL's body frame.
+        rest: rest joints of the body (22, 3), metres, SMPL's body frame.
 
     Raises:
-        InputError: for a clip of fewer than 3 frames at 60 Hz, or one that was imported onto another body.
+        InputError: if the clip has fewer than 3 frames at 60 Hz, or was imported onto another body.
     """
     import torch
 
@@ -223,28 +223,28 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     recorded = read_clip(path, path.stem)
     check_imported_body([path], rest, "the network")
     if faults := check_plausible(path, recorded):
-        notify(f"{path}: unusual, {faults}")
+        notify(f"{path}: is unusual ({faults})")
     clip, _ = resample(recorded)
     if len(clip) < 3:
-        raise InputError(f"{path}: {len(clip)} frames at 60 Hz; must have 3 or more")
+        raise InputError(f"{path}: has {len(clip)} frames at 60 Hz; must have 3 or more")
     tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, rest))
     return motion_frames(*tensors).numpy()
 
 
 class ClipSource:
-    """Plays a clip as a headset would send it: at a fixed rate, in real time, in endless rounds.
+    """Plays a clip in real time at a fixed rate, like a headset. The clip repeats endlessly.
 
-    A sample that is due while the last one is still being processed is dropped, as with a device.
+    A sample is dropped if the processing of the previous sample takes too long.
 
     Args:
         clip: the clip.
-        hz: samples per second.
-        clock: returns the time, seconds; the machine's by default.
-        sleep: waits for a number of seconds; the machine's by default.
+        hz: number of samples per second.
+        clock: returns the time, seconds; by default, the machine's clock.
+        sleep: waits for a number of seconds; by default, `time.sleep`.
     """
 
     space: SpaceName = "amass"
-    worn = False
+    has_wearer = False
 
     def __init__(
         self,
@@ -254,13 +254,13 @@ class ClipSource:
         sleep: Callable[[float], None] = time.sleep,
     ):
         self.clip, self.hz, self.name = clip, float(hz), f"{clip.name} at {hz:g} Hz"
-        self.count = int(clip.seconds * hz + 1e-9) + 1  # samples of a round
+        self.count = int(clip.seconds * hz + 1e-9) + 1  # number of samples in a repetition
         self.clock, self.sleep = clock, sleep
         self.next = 0
         self.start: float | None = None
 
     def read(self) -> SourceSample | None:
-        """Wait for the sample that is due next, and return it."""
+        """Wait for the next sample, and return it."""
         now = self.clock()
         self.start = now if self.start is None else self.start
         due = int((now - self.start) * self.hz + 1e-6)
@@ -270,40 +270,39 @@ class ClipSource:
         self.next = index + 1
         turn, step = divmod(index, self.count)
         within = step / self.hz
-        trackers = self.clip.trackers(within)
+        trackers = self.clip.interpolate_trackers(within)
         return SourceSample(turn * self.round_seconds + within, trackers, time.perf_counter(), dropped)
 
     @property
     def round_seconds(self) -> float:
-        """The seconds from the beginning of one round to the beginning of the next."""
+        """The seconds from the start of one repetition to the start of the next repetition."""
         return (self.count - 1) / self.hz + PAUSE
 
-    def truth(self, time: float) -> np.ndarray:
+    def get_true_joints(self, time: float) -> np.ndarray:
         """Return the true joints (22, 3), metres, AMASS' world."""
-        half = PAUSE / 2  # so that a time that rounding puts before a round's beginning belongs to it
-        return self.clip.truth((time + half) % self.round_seconds - half)
+        half = PAUSE / 2  # a time that is rounded to before the start of a repetition still belongs to it
+        return self.clip.interpolate_joints((time + half) % self.round_seconds - half)
 
     def close(self) -> None:
-        """Do nothing, since this source holds no resources."""
+        """Do nothing. This source does not hold resources."""
 
 
 class PacketSource:
-    """Takes packets that arrive at a UDP port, from this machine and from listed other machines.
+    """Receives packets at a UDP port, from this machine and from listed other machines.
 
     Args:
         name: the kind of packets, for messages.
-        port: the port; 0 for any free one.
-        parse: reads the packet of a datagram, or raises InputError.
+        port: the port; 0 for any free port.
+        parse: parses a datagram, or raises InputError.
         space: the frame of reference of the poses.
-        senders: the other machines whose packets are accepted; without any, only this machine can reach the
-            port.
-        report: gets a line about each machine whose packets are rejected.
+        senders: other machines that may send packets. If empty, only this machine can reach the port.
+        report: gets a line about each machine with rejected packets.
 
     Raises:
         InputError: if the port is in use.
     """
 
-    worn = True
+    has_wearer = True
 
     def __init__(
         self,
@@ -324,16 +323,17 @@ class PacketSource:
             self.socket.close()
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 raise
-            raise InputError(f"port {port}: is in use or forbidden; use another one, 1024 to 65535") from None
+            raise InputError(
+                f"port {port}: is in use or forbidden; use another port from 1024 to 65535"
+            ) from None
         self.port = self.socket.getsockname()[1]
         self.name = f"{name} packets on port {self.port}"
         self.last: int | None = None
 
     def read(self) -> SourceSample | None:
-        """Return the next packet's sample; None if no packet came in time, or if it is left out.
+        """Return the sample of the next packet; None if no packet arrives in time, or if it is dropped.
 
-        A packet that others have overtaken is left out; it was counted as lost when they came. Raises
-        InputError for a malformed packet.
+        A late packet is dropped. It was already counted as lost. Raises InputError for a malformed packet.
         """
         try:
             datagram, (sender, _) = self.socket.recvfrom(LARGEST)
@@ -357,9 +357,9 @@ class PacketSource:
         now = time.monotonic() if packet.time is None else packet.time
         return SourceSample(now, packet.trackers, arrived, dropped)
 
-    def truth(self, time: float) -> None:
-        """Return None, since the truth is unknown."""
+    def get_true_joints(self, time: float) -> None:
+        """Return None, because the true joints are unknown."""
 
     def close(self) -> None:
-        """Release the port."""
+        """Close the port."""
         self.socket.close()

@@ -1,1 +1,1 @@
-"""A static site that times networks in the visitor's browser, plays clips, and runs on headsets."""
+"""A static website that times networks in the browser, plays clips, and runs on headsets."""

@@ -1,4 +1,4 @@
-"""A site as a folder of static files: the page, ONNX Runtime, networks, clips, and a service worker."""
+"""Writes a static website: the page, ONNX Runtime, networks, clips, and a service worker."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from memmlp.common.npm import ONNXRUNTIME_WEB, read_package_files
 from memmlp.common.page_server import build_security_policy, read_page_file
 from memmlp.common.progress import announce
 from memmlp.deploy.export import export
-from memmlp.deploy.latency import yardstick
-from memmlp.deploy.lower_precision import lower
+from memmlp.deploy.latency import make_yardstick
+from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.live.rotations import BodyTree, matrix_to_quaternion
 from memmlp.live.session.loop import TOP
 from memmlp.live.session.sources import TrackedClip
 from memmlp.live.spaces import SPACES
 from memmlp.live.trackers_to_body_graph import export_full
-from memmlp.live.wearer import stature
+from memmlp.live.wearer import compute_body_height
 from memmlp.motion.body import FPS, FRAME_DIM, JOINTS, PARENTS, TRACKED
 from memmlp.motion.limb_shapes import HEAT, LIMBS
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 from memmlp.networks.streaming import has_stream, streaming
 
 ABOUT = "site.json"
-SPACE = SPACES["openxr"]  # of everything on the site
+SPACE = SPACES["openxr"]  # the frame of reference of all poses on the site
 OTHER_PAGES = {
     "memmlp.live.session": (
         "stage.js", "history.js", "three/three.module.min.js", "three/three.core.min.js",
@@ -48,20 +48,22 @@ OTHER_PAGES = {
     ),
     "memmlp.common": ("dom.js", "style.css"),
 }  # fmt: skip
-"""Files of other pages that a site uses, by the package that contains them."""
+"""Files from other pages of memmlp, by package."""
 RUNTIME = {
     "dist/ort.wasm.bundle.min.mjs": "ort/wasm.js",
     "dist/ort-wasm-simd-threaded.wasm": "ort/wasm.wasm.gz",
 }
-"""Where ONNX Runtime's files lie on the site; every server knows modules that end in .js."""
+"""Paths of ONNX Runtime's files in its package and on the site. All servers support the suffix .js."""
 EYES = 0.936
-"""The height of the eyes over that of the person (Drillis and Contini 1966, in Winter, Biomechanics and Motor
-Control of Human Movement, fig. 4.1), from which a headset estimates its wearer's height."""
+"""Eye height divided by body height (Drillis and Contini 1966, in Winter, Biomechanics and Motor Control of
+Human Movement, fig. 4.1). The page estimates the user's height from the height of the headset."""
 NUMBERS = 9 + 12 + 66
-"""Numbers per frame: positions and quaternions (xyzw) of head and wrists, joints; metres, openxr axes."""
-LEAST = 32_768  # bytes; smaller tensors, such as those of normalisation, and constants, keep their values
-PERIOD = 4099  # random numbers that are repeated in a timed graph; its file is compressed to almost nothing
-RANDOM = "random"  # the run of a network with random weights, which is only timed
+"""Number of values per frame: positions and quaternions (xyzw) of head and wrists, and joint positions.
+
+Positions are in metres; all values are in openxr axes."""
+LEAST = 32_768  # bytes; smaller tensors, such as constants, keep their values
+PERIOD = 4099  # random weights repeat after this number of values, so files compress well
+RANDOM = "random"  # the run id of networks with random weights, which are only timed
 PRECISIONS = {"naive": ("fp32",), "streaming": ("fp32", "int8", "fp16")}
 
 Entry = dict[str, Any]
@@ -69,15 +71,15 @@ Entry = dict[str, Any]
 
 @dataclass(frozen=True)
 class SiteNetwork:
-    """A network of a site.
+    """A network on a site.
 
     Attributes:
-        key: the network's name in files and in the page's code.
-        name: the network's readable name.
+        key: the network's name in file names and the page's code.
+        name: the network's display name.
         run: the id of the network's run; "random" for random weights.
-        model: the network as it was trained.
-        clips: the names of those of its test clips that are on the site.
-        remark: a warning that the page shows, such as that it is hardly trained; empty for no warning.
+        model: the trained network.
+        clips: names of its test clips on the site.
+        remark: a warning on the page, such as too little training; empty for no warning.
     """
 
     key: str
@@ -89,11 +91,11 @@ class SiteNetwork:
 
 
 class SiteClip(NamedTuple):
-    """A clip of a site.
+    """A clip on a site.
 
     Attributes:
-        key: the clip's name in files: a digest of its content.
-        name: the clip's readable name.
+        key: the clip's name in file names: a digest of the content.
+        name: the clip's display name.
         content: little-endian float32 (frames, 87).
     """
 
@@ -103,7 +105,7 @@ class SiteClip(NamedTuple):
 
     @property
     def frames(self) -> int:
-        """Number of the clip's frames, at 60 Hz."""
+        """Number of frames at 60 Hz."""
         return len(self.content) // (4 * NUMBERS)
 
 
@@ -113,13 +115,17 @@ def pack_clip(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
     Args:
         name: the clip's name.
         frames: [X | Theta] (N, 252) at 60 Hz, world (`memmlp.motion.body`).
-        seconds: the longest duration of the part.
+        seconds: maximum duration of the part, seconds.
     """
     count = min(len(frames), round(seconds * FPS))
     first = (len(frames) - count) // 2
     clip = TrackedClip(name, frames[first : first + count])
-    rotations = matrix_to_quaternion(SPACE.rotations_out(clip.rotations).reshape(-1, 3, 3))
-    parts = [SPACE.positions_out(clip.positions), rotations, SPACE.positions_out(clip.joints)]
+    rotations = matrix_to_quaternion(SPACE.convert_rotations_from_amass(clip.rotations).reshape(-1, 3, 3))
+    parts = [
+        SPACE.convert_positions_from_amass(clip.positions),
+        rotations,
+        SPACE.convert_positions_from_amass(clip.joints),
+    ]
     content = np.concatenate([part.reshape(count, -1) for part in parts], 1).astype("<f4").tobytes()
     return SiteClip(hashlib.sha256(content).hexdigest()[:12], name, content)
 
@@ -129,29 +135,29 @@ class Site:
     """The contents of a site.
 
     Attributes:
-        networks: the networks; those that are trained play clips and run on headsets.
-        base: the network that the others' times are compared with; None for a site without a bench.
-        clips: the clips that can be played.
+        networks: the networks. Trained networks play clips and run on headsets.
+        base: the reference network for time comparisons; None for a site without a bench.
+        clips: the clips to play.
     """
 
     networks: Sequence[SiteNetwork]
     base: SiteNetwork | None
     clips: Sequence[SiteClip]
 
-    def make(self, out: Path) -> int:
-        """Write the site, completely or not at all, and return its size in bytes.
+    def write(self, out: Path) -> int:
+        """Write the site atomically, and return its size in bytes.
 
-        An earlier site in that folder is replaced.
+        An earlier site in the folder is replaced.
 
         Raises:
-            InputError: if the folder holds something else, or ONNX Runtime can't be downloaded.
+            InputError: if the folder has other content, or ONNX Runtime cannot be downloaded.
         """
-        check_place(out)
+        check_site_folder(out)
         unfinished = temporary_path(out)
         try:
             unfinished.mkdir(parents=True)
-            self._fill(unfinished)
-            total = sum(path.stat().st_size for path in _files(unfinished))
+            self._write_contents(unfinished)
+            total = sum(path.stat().st_size for path in _list_files(unfinished))
             earlier = temporary_path(out)
             if out.exists():
                 out.rename(earlier)
@@ -161,12 +167,12 @@ class Site:
             shutil.rmtree(unfinished, ignore_errors=True)
         return total
 
-    def _fill(self, folder: Path) -> None:
+    def _write_contents(self, folder: Path) -> None:
         for name, content in read_package_files(ONNXRUNTIME_WEB, RUNTIME).items():
-            _write(folder, RUNTIME[name], content)
+            _write_file(folder, RUNTIME[name], content)
         clips = [
             {"key": clip.key, "name": clip.name, "frames": clip.frames}
-            | {"file": _write(folder, f"clips/{clip.key}.gz", clip.content)}
+            | {"file": _write_file(folder, f"clips/{clip.key}.gz", clip.content)}
             for clip in self.clips
         ]
         bench = self.base is not None
@@ -183,29 +189,29 @@ class Site:
         }
         if self.base is not None:
             about["base"] = write_network(folder, self.base, bench)
-            about["yardstick"] = write_timed(folder, "yardstick", yardstick())
-        _write(folder, ABOUT, (json.dumps(about, separators=(",", ":")) + "\n").encode())
+            about["yardstick"] = write_timed_graph(folder, "yardstick", make_yardstick())
+        _write_file(folder, ABOUT, (json.dumps(about, separators=(",", ":")) + "\n").encode())
         _write_page(folder)
 
 
-def check_place(out: Path) -> None:
-    """Raise InputError if no site may be written there: over other content, or in place of a file."""
+def check_site_folder(out: Path) -> None:
+    """Raise InputError unless `out` is a new folder or an earlier site."""
     expected = "expected a new folder, or an earlier site"
     if out.exists() and not out.is_dir():
         raise InputError(f"--out {out}: is a file; {expected}")
     if out.is_dir() and any(out.iterdir()) and "packages" not in read_json(out / ABOUT):
         raise InputError(f"--out {out}: has other content; {expected}")
     if not out.absolute().parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}")
+        raise InputError(f"--out {out}: folder {out.parent} does not exist")
 
 
 def write_network(folder: Path, network: SiteNetwork, bench: bool) -> Entry:
-    """Write a network's graphs into a site's folder, and return its entry in the site's description.
+    """Write a network's graphs into a site's folder, and return the network's entry in `site.json`.
 
     Args:
         folder: the site's folder.
-        network: the network; one with random weights is only timed.
-        bench: whether to write the graphs that are timed; if not, only the one that plays clips.
+        network: the network. A network with random weights is only timed.
+        bench: whether to write the timed graphs. The graph that plays clips is always written.
     """
     announce(f"web: export {network.name}")
     model, played = network.model.cpu().eval(), None
@@ -213,7 +219,7 @@ def write_network(folder: Path, network: SiteNetwork, bench: bool) -> Entry:
         with tempfile.TemporaryDirectory() as temporary:
             path = Path(temporary) / "whole.onnx"
             export_full(streaming(model) if has_stream(model) else model, path, network.run, SPACE.name)
-            played = _write(folder, f"networks/{network.key}.onnx.gz", path.read_bytes())
+            played = _write_file(folder, f"networks/{network.key}.onnx.gz", path.read_bytes())
     rest = model.normalizer.rest.double().numpy()
     return {
         "key": network.key,
@@ -225,7 +231,7 @@ def write_network(folder: Path, network: SiteNetwork, bench: bool) -> Entry:
         "body": {  # head and wrists in the T-pose, the lowest joint's height, and the body height, metres
             "rest": (rest[list(TRACKED)] * SPACE.body).tolist(),
             "floor": float(rest[:, 1].min()),
-            "height": stature(BodyTree(JOINTS, PARENTS, rest)),
+            "height": compute_body_height(BodyTree(JOINTS, PARENTS, rest)),
             "eyes": EYES,
         },
         "play": played,
@@ -236,12 +242,15 @@ def write_network(folder: Path, network: SiteNetwork, bench: bool) -> Entry:
 
 
 def write_graphs(folder: Path, network: SiteNetwork) -> Iterator[Entry]:
-    """Write the graphs of a network that are timed, with random weights, and yield an entry about each.
+    """Write the timed graphs of a network with random weights, and yield an entry for each.
 
-    They are the network as published, its stream, and the stream in lower precision, each as the step alone
-    and as the full graph from trackers to joints. There is no full graph in int8.
+    The graphs are the published network, its stream, and its stream in lower precisions. Each is written as a
+    step and as a full graph from trackers to joints, except that int8 does not have a full graph.
     """
-    model, frames = network.model, [0.1 * torch.randn(60, FRAME_DIM)]  # int8's ranges do not matter for time
+    model, frames = (
+        network.model,
+        [0.1 * torch.randn(60, FRAME_DIM)],
+    )  # the ranges of int8 do not affect the time
     graphs: dict[str, MotionModel | StreamingGraph] = {"naive": model}
     if has_stream(model):
         graphs["streaming"] = streaming(model)
@@ -256,25 +265,24 @@ def write_graphs(folder: Path, network: SiteNetwork) -> Iterator[Entry]:
                     if isinstance(graph, StreamingGraph) and precision != "fp32":
                         if part == "whole" and precision == "int8":
                             continue
-                        lower(precision, source, lowered, graph, frames)
+                        write_lower_precision(precision, source, lowered, graph, frames)
                         source = lowered
                     file = f"{network.key}-{name}-{precision}-{part}"
-                    entry[part] = write_timed(folder, file, onnx.load(source))
+                    entry[part] = write_timed_graph(folder, file, onnx.load(source))
                 yield entry
 
 
-def write_timed(folder: Path, name: str, model: onnx.ModelProto) -> str:
-    """Write a graph that is only timed, with random weights; return its address."""
+def write_timed_graph(folder: Path, name: str, model: onnx.ModelProto) -> str:
+    """Write a graph with random weights for timing, and return its address."""
     randomize_weights(model)
-    return _write(folder, f"networks/{name}.onnx.gz", model.SerializeToString())
+    return _write_file(folder, f"networks/{name}.onnx.gz", model.SerializeToString())
 
 
 def randomize_weights(model: onnx.ModelProto) -> None:
-    """Replace the large weights of a graph by repeated random numbers of the same standard deviation.
+    """Replace the large weights of a graph by repeated random numbers with the same standard deviation.
 
-    The weights' values do not matter for a step's time, and repeated numbers keep a compressed site small.
-    Numbers of about the same size keep the operations' speed: none becomes infinite, or so small that a
-    processor takes longer over it.
+    Weights do not affect the time of a step, and repeated numbers compress well. The standard deviation stays
+    the same, because infinite or very small values would slow down a processor.
     """
     random = np.random.default_rng(0)
     for tensor in model.graph.initializer:
@@ -282,19 +290,19 @@ def randomize_weights(model: onnx.ModelProto) -> None:
         if len(tensor.raw_data) < LEAST or values.dtype not in (np.float32, np.float16, np.int8):
             continue
         scale = np.sqrt(np.square(values.astype(np.float64)).mean())
-        if np.isfinite(scale):  # a mask is not
+        if np.isfinite(scale):  # masks contain infinity
             drawn = random.normal(0, scale, PERIOD)
             if values.dtype == np.int8:
                 drawn = drawn.round().clip(-127, 127)
             tensor.raw_data = np.resize(drawn.astype(values.dtype), values.size).tobytes()
 
 
-def _files(folder: Path) -> list[Path]:
+def _list_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
-def _write(folder: Path, address: str, content: bytes) -> str:
-    """Write a file, compressed if its address ends in .gz, and return its address on the site."""
+def _write_file(folder: Path, address: str, content: bytes) -> str:
+    """Write a file, and return its address on the site. Addresses with the suffix .gz are compressed."""
     path = folder / address
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(gzip.compress(content, 6, mtime=0) if path.suffix == ".gz" else content)
@@ -302,19 +310,19 @@ def _write(folder: Path, address: str, content: bytes) -> str:
 
 
 def _write_page(folder: Path) -> None:
-    """Write the page's files, with its policy, and a service worker that lists all files of the site.
+    """Write the page's files with its security policy, and a service worker that lists all files.
 
-    The worker's version changes with any file.
+    The version of the worker changes if any file changes.
     """
     own = resources.files("memmlp.live.web").joinpath("page")
     for package, names in {"memmlp.live.web": [path.name for path in own.iterdir()], **OTHER_PAGES}.items():
         for name in names:
-            _write(folder, name, read_page_file(package, name))
+            _write_file(folder, name, read_page_file(package, name))
     index = (folder / "index.html").read_text("utf-8")
     policy = build_security_policy(index, "'wasm-unsafe-eval'")
-    _write(folder, "index.html", index.replace("POLICY", policy).encode())
-    digests = {str(file.relative_to(folder).as_posix()): file_digest(file) for file in _files(folder)}
+    _write_file(folder, "index.html", index.replace("POLICY", policy).encode())
+    digests = {str(file.relative_to(folder).as_posix()): file_digest(file) for file in _list_files(folder)}
     version = hashlib.sha256(json.dumps(digests).encode()).hexdigest()[:16]
     others = [name for name in digests if name != "sw.js"]
     head = f"const VERSION = {json.dumps(version)};\nconst FILES = {json.dumps(others)};\n"
-    _write(folder, "sw.js", head.encode() + (folder / "sw.js").read_bytes())
+    _write_file(folder, "sw.js", head.encode() + (folder / "sw.js").read_bytes())

@@ -152,5 +152,5 @@ def find_worst_seconds(errors: np.ndarray) -> list[dict[str, Any]]:
 
 
 def _millimetres(joints: np.ndarray) -> list[list[int]]:
-    positions = PAGE_AXES.positions_out(np.asarray(joints, np.float64))
+    positions = PAGE_AXES.convert_positions_from_amass(np.asarray(joints, np.float64))
     return (1000 * positions).round().astype(int).reshape(len(joints), -1).tolist()

@@ -15,8 +15,8 @@ from wearer import body_frame
 
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
-from memmlp.live.session.loop import avatar_message, make_greeting, to_millimetres
-from memmlp.live.session.server import Hub, LiveServer, mannequin_vrm, read_files
+from memmlp.live.session.loop import convert_to_millimetres, make_avatar_message, make_greeting
+from memmlp.live.session.server import Hub, LiveServer, load_page_files, make_mannequin_vrm
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
@@ -30,7 +30,7 @@ def pose(size: float) -> BodyFrame:
     """A person of a size, with each joint turned by up to some 40 degrees, 30 for the whole."""
     local = Rotation.from_rotvec(RANDOM.uniform(-0.4, 0.4, (22, 3))).as_matrix()
     local[0] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ local[0]
-    body = BodyTree(JOINTS, PARENTS, REST).positions(local)
+    body = BodyTree(JOINTS, PARENTS, REST).compute_positions(local)
     return body_frame(0.0, local, size * (body + np.array([0.5, -0.25, 1.6])), size * REST)
 
 
@@ -71,9 +71,9 @@ def of_vrm_0(content: dict[str, Any]) -> None:
 
 @pytest.fixture(scope="module")
 def own() -> bytes:
-    vrm = mannequin_vrm(REST)
+    vrm = make_mannequin_vrm(REST)
     try:
-        read_files(vrm)
+        load_page_files(vrm)
     except InputError as error:
         pytest.skip(str(error))
     return vrm
@@ -98,11 +98,11 @@ def test_an_avatar_s_bones_are_where_the_joints_are(
 
     An avatar that lacks bones stands otherwise, but all its bones have the right direction.
     """
-    files = read_files(edited(own, edit) if edit else own)
+    files = load_page_files(edited(own, edit) if edit else own)
     person = pose(size)
     words = make_greeting(ClipSource(clip, 60), "tiny", avatar=True)["avatar"]
-    given = avatar_message(person)
-    joints = np.array(to_millimetres(person.positions)).reshape(22, 3) / 1000
+    given = make_avatar_message(person)
+    joints = np.array(convert_to_millimetres(person.positions)).reshape(22, 3) / 1000
     script = """
       import('./avatar.js').then(async ({ Avatar }) => {
         const avatar = await Avatar.load('avatar.vrm', WORDS);
@@ -137,7 +137,7 @@ def test_an_avatar_s_bones_are_where_the_joints_are(
 @pytest.mark.slow
 def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: bytes, clip: TrackedClip):
     """Also on a page that was loaded after the wearer's height was changed there."""
-    files = read_files(own)
+    files = load_page_files(own)
     hub = Hub(make_greeting(ClipSource(clip, 60), "tiny", avatar=True))
     with LiveServer(hub, 0, files=files) as server:
         browser.open(server.url)
@@ -151,7 +151,10 @@ def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: 
         })""")
         for number, size in enumerate((1.2, 0.9)):
             person = pose(size)
-            told = avatar_message(person) | {"positions": to_millimetres(person.positions), "truth": None}
+            told = make_avatar_message(person) | {
+                "positions": convert_to_millimetres(person.positions),
+                "truth": None,
+            }
             times = {"number": number, "time": 0.0, "held": [], "jumping": False, "ms": 1.0, "whole": 1.0}
             server.hub.publish(told | times | {"dropped": 0, "malformed": 0})
             browser.wait(f"Math.abs(window.size - {size}) < 1e-3")

@@ -133,7 +133,7 @@ def test_another_command_at_the_address_gets_a_page_of_its_own(browser: Browser,
 class Worn(ClipSource):
     """A clip that counts as somebody's devices."""
 
-    worn = True
+    has_wearer = True
 
 
 def test_the_wearer_fits_the_stream_from_the_page(
@@ -145,7 +145,10 @@ def test_the_wearer_fits_the_stream_from_the_page(
     fitting = Fitting(
         stream, "amass", None, hub.publish_state, clock=lambda: 0.0
     )  # a countdown ends when cancelled
-    with LiveServer(hub, 0, take_order=fitting.ask) as server, playing(stream, source, hub, None, fitting):
+    with (
+        LiveServer(hub, 0, take_order=fitting.submit_order) as server,
+        playing(stream, source, hub, None, fitting),
+    ):
         browser.open(server.url)
         browser.wait("document.querySelector('#height').value == '172'")
         for name, value in (("height", 186), ("floor", 5)):
@@ -161,7 +164,7 @@ def test_the_wearer_fits_the_stream_from_the_page(
         assert browser.wait("counted[0]") == "5"  # whatever it shows by now
         browser.click("#cancel")
         browser.wait("document.querySelector('#countdown').hidden")
-        fitting.ask({"action": "calibrate", "value": 0})
+        fitting.submit_order({"action": "calibrate", "value": 0})
         browser.wait("document.querySelector('#said').classList.contains('failed')")
         whole = "Number(document.querySelector('#latency [data-key=whole] td').textContent)"
         assert browser.wait(whole) > 0

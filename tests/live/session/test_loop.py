@@ -16,7 +16,7 @@ from memmlp.live.session.loop import COUNTDOWN, Fitting, run_loop
 from memmlp.live.session.sources import ClipSource, SourceSample, TrackedClip
 from memmlp.live.stream import Stream
 from memmlp.live.tracker_input import JUMPS
-from memmlp.live.tracker_resampling import t_pose
+from memmlp.live.tracker_resampling import make_t_pose
 from memmlp.live.wearer import read_calibration
 
 pytestmark = pytest.mark.slow
@@ -37,11 +37,11 @@ class Wearing:
         self.states.append(state)
 
     def order(self, action: str, value: float | None = None) -> None:
-        self.fitting.ask({"action": action, "value": value})
+        self.fitting.submit_order({"action": action, "value": value})
 
     def pose(self, shift: float = 0.0, lower: float = 0.0):
         """Devices of a person in T-pose, 5 cm before the joints; the left hand shifted, both lowered."""
-        pose = t_pose(self.stream.network.body, np.array([0.0, 0.0, 1.57]), 0.0)
+        pose = make_t_pose(self.stream.network.body, np.array([0.0, 0.0, 1.57]), 0.0)
         positions = pose.positions + np.array([0, -0.05, 0])
         positions[1, 1] += shift
         positions[1:, 2] -= lower
@@ -196,7 +196,7 @@ def test_frames_come_at_60_hz_with_truth_and_prediction_in_the_page_s_axes(netwo
         assert [m["number"] for m in messages] == list(range(len(messages)))
         assert [m["time"] for m in messages] == pytest.approx(np.arange(len(messages)) / 60, abs=1e-4)
         assert len(messages) >= 119
-    message, truth = messages[30], clip.truth(0.5)
+    message, truth = messages[30], clip.interpolate_joints(0.5)
     expected = 1000 * truth[:, [0, 2, 1]].ravel() * np.tile([1, 1, -1], 22)
     assert message["truth"] == pytest.approx(expected, abs=1)
     joints = np.array(message["positions"]).reshape(22, 3)
@@ -228,5 +228,5 @@ class InMilliseconds(Instant):
 def test_times_in_milliseconds_are_reported_once(network: Path, clip: TrackedClip):
     messages, said = played(network, clip, 60, InMilliseconds)
     assert len(said) == 1
-    assert said[0].endswith("is `time` in seconds?")
+    assert said[0].endswith("check that `time` is in seconds")
     assert [message["jumping"] for message in messages] == [n >= JUMPS for n in range(len(messages))]

@@ -14,7 +14,7 @@ from processes import PATIENCE
 
 from memmlp.common.errors import InputError
 from memmlp.live.session.loop import make_greeting
-from memmlp.live.session.server import QUEUED, Hub, LiveServer, mannequin_vrm, read_files, read_vrm
+from memmlp.live.session.server import QUEUED, Hub, LiveServer, load_page_files, make_mannequin_vrm, read_vrm
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.motion.body import builtin_rest_joints
 
@@ -63,7 +63,7 @@ def test_a_slow_page_loses_the_oldest_frames_and_no_state():
     hub = Hub({})
     hub.publish_state("wearer", {"height": 170})
     hub.publish_state("wearer", {"height": 180})
-    slow = hub.events()
+    slow = hub.stream_events()
     assert next(slow).split(b"\n\n")[1] == b'event: wearer\ndata: {"height":180}'  # the newest state
     hub.publish_state("wearer", {"calibrated": True})
     for number in range(QUEUED + 2):
@@ -75,7 +75,7 @@ def test_a_slow_page_loses_the_oldest_frames_and_no_state():
 
 def test_the_pages_files_are_served_and_nothing_else(server: LiveServer):
     types = {"js": "text/javascript", "css": "text/css", "html": "text/html"}
-    for name, content in read_files().items():
+    for name, content in load_page_files().items():
         response = get(server, f"/{name}")
         kind = f"{types[name.rsplit('.')[-1]]}; charset=utf-8"
         assert (response.status, response.headers["Content-Type"]) == (200, kind), name
@@ -83,7 +83,7 @@ def test_the_pages_files_are_served_and_nothing_else(server: LiveServer):
         if not name.startswith("three/"):  # the page loads nothing from elsewhere
             assert b"//" not in content.replace(b"// ", b""), name
             assert b"npm" not in content or name == "avatar.js"
-    assert get(server, "/").read() == read_files()["index.html"]
+    assert get(server, "/").read() == load_page_files()["index.html"]
     for path in ("/../server.py", "/three/LICENSE/..", "/%2e%2e/server.py", "/main"):
         assert get(server, path).status == 404
     # A page of another site, whose name was made to mean this machine, gets nothing.
@@ -163,7 +163,7 @@ def vrm(content: object) -> bytes:
 
 
 def test_files_without_an_avatar_are_rejected(tmp_path: Path):
-    mannequin = mannequin_vrm(builtin_rest_joints())
+    mannequin = make_mannequin_vrm(builtin_rest_joints())
     for name, content in (("own", mannequin), ("old", vrm({"extensions": {"VRM": {}}}))):
         (tmp_path / name).write_bytes(content)
         assert read_vrm(tmp_path / name) == content

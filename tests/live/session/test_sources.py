@@ -25,9 +25,9 @@ from memmlp.live.session.sources import (
     Packet,
     PacketSource,
     TrackedClip,
-    from_json,
-    from_osc,
-    npz_frames,
+    parse_json_packet,
+    parse_osc_packet,
+    read_npz_frames,
 )
 from memmlp.live.tracker_resampling import TRACKERS
 from memmlp.motion.body import builtin_rest_joints
@@ -56,7 +56,7 @@ def fields(packet: Packet) -> dict[str, Any]:
     return {"time": packet.time, "seq": packet.seq, **dict(zip(TRACKERS, poses, strict=True))}
 
 
-KINDS = {"json": (to_json, from_json), "osc": (to_osc, from_osc)}
+KINDS = {"json": (to_json, parse_json_packet), "osc": (to_osc, parse_osc_packet)}
 kinds = pytest.mark.parametrize("kind", KINDS)
 
 
@@ -80,7 +80,7 @@ def test_bad_packets_are_rejected():
     wholes = [{}, {"time": 1.0}, [HEAD], None, {"head": HEAD, "seq": 1.5}]
     for fields in (*wholes, *({"head": head} for head in heads)):
         with pytest.raises(InputError):
-            from_json(json.dumps(fields).encode())
+            parse_json_packet(json.dumps(fields).encode())
 
 
 @given(st.binary(max_size=200))
@@ -138,16 +138,16 @@ def test_a_clip_comes_at_its_rate(clip: TrackedClip, hz: float, count: int):
 
 def test_samples_are_the_clips_frames_or_between_them(clip: TrackedClip):
     for index in (0, 7, 119):
-        position, quaternion = clip.trackers(index / 60)[1]
+        position, quaternion = clip.interpolate_trackers(index / 60)[1]
         assert position == pytest.approx(clip.positions[index, 1], abs=1e-9)
         assert quaternion_to_matrix(quaternion) == pytest.approx(clip.rotations[index, 1], abs=1e-6)
-        assert clip.truth(index / 60) == pytest.approx(clip.joints[index], abs=1e-9)
-    position, quaternion = clip.trackers(10.5 / 60)[2]
+        assert clip.interpolate_joints(index / 60) == pytest.approx(clip.joints[index], abs=1e-9)
+    position, quaternion = clip.interpolate_trackers(10.5 / 60)[2]
     assert position == pytest.approx(clip.positions[10:12, 2].mean(0), abs=1e-9)
     middle = quaternion_to_matrix(quaternion)
     a, b = (np.linalg.norm(middle - clip.rotations[i, 2]) for i in (10, 11))
     assert a == pytest.approx(b, abs=1e-6)
-    assert clip.truth(10.5 / 60) == pytest.approx(clip.joints[10:12].mean(0), abs=1e-9)
+    assert clip.interpolate_joints(10.5 / 60) == pytest.approx(clip.joints[10:12].mean(0), abs=1e-9)
 
 
 def test_what_is_due_while_somebody_works_is_dropped(clip: TrackedClip):
@@ -167,7 +167,7 @@ def test_a_round_follows_after_a_pause(clip: TrackedClip):
     samples = [played.read() for _ in range(121)]
     assert samples[120].time - samples[119].time == pytest.approx(PAUSE)
     assert np.array_equal(samples[120].trackers[0][0], samples[0].trackers[0][0])
-    assert np.array_equal(played.truth(samples[120].time), played.truth(0.0))
+    assert np.array_equal(played.get_true_joints(samples[120].time), played.get_true_joints(0.0))
 
 
 def test_the_truth_of_each_round_is_that_of_the_first(clip: TrackedClip):
@@ -176,13 +176,13 @@ def test_the_truth_of_each_round_is_that_of_the_first(clip: TrackedClip):
         played = source(clip, hz, Clock())
         for turn in range(1, 200):
             for step in (0, 1, played.count - 1):
-                truth = played.truth(turn * played.round_seconds + step / hz)
-                np.testing.assert_allclose(truth, clip.truth(step / hz), atol=1e-6)
+                truth = played.get_true_joints(turn * played.round_seconds + step / hz)
+                np.testing.assert_allclose(truth, clip.interpolate_joints(step / hz), atol=1e-6)
 
 
 def received(*numbers: int) -> list[int | None]:
     """How many packets were missing before each packet; None for one that is left out."""
-    source = PacketSource("JSON", 0, from_json, "openxr")
+    source = PacketSource("JSON", 0, parse_json_packet, "openxr")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.sendto(b"nonsense", (HOST, source.port))
         for seq in numbers:
@@ -214,7 +214,7 @@ class Datagrams:
 def test_only_listed_machines_packets_are_accepted():
     lines: list[str] = []
     senders = [IPv4Network("192.168.1.9"), IPv4Network("10.0.0.0/8")]
-    arrives = PacketSource("UDP", 0, from_json, "amass", senders, lines.append)
+    arrives = PacketSource("UDP", 0, parse_json_packet, "amass", senders, lines.append)
     assert arrives.socket.getsockname()[0] == "0.0.0.0"
     arrives.close()
     taken = {}
@@ -228,12 +228,12 @@ def test_only_listed_machines_packets_are_accepted():
 
 
 def test_only_this_machine_is_listened_to():
-    arrives = PacketSource("UDP", 0, from_json, "amass")
+    arrives = PacketSource("UDP", 0, parse_json_packet, "amass")
     assert arrives.socket.getsockname()[0] == "127.0.0.1"
     with pytest.raises(InputError, match=f"port {arrives.port}: "):
-        PacketSource("UDP", arrives.port, from_json, "amass")
+        PacketSource("UDP", arrives.port, parse_json_packet, "amass")
     arrives.close()
-    PacketSource("UDP", arrives.port, from_json, "amass").close()
+    PacketSource("UDP", arrives.port, parse_json_packet, "amass").close()
 
 
 def test_an_unusual_file_is_reported_and_a_short_one_rejected(tmp_path: Path):
@@ -243,7 +243,7 @@ def test_an_unusual_file_is_reported_and_a_short_one_rejected(tmp_path: Path):
     write_clip(tmp_path / "b.npz", Clip("b", turns[:2], np.zeros((2, 3)), 60.0))
     said: list[str] = []
     with send_announcements_to(said.append):
-        assert len(npz_frames(tmp_path / "a.npz", builtin_rest_joints())) == 4
-        with pytest.raises(InputError, match=r"b\.npz: 2 frames"):
-            npz_frames(tmp_path / "b.npz", builtin_rest_joints())
-    assert said[0].startswith(f"{tmp_path / 'a.npz'}: unusual")
+        assert len(read_npz_frames(tmp_path / "a.npz", builtin_rest_joints())) == 4
+        with pytest.raises(InputError, match=r"b\.npz: has 2 frames"):
+            read_npz_frames(tmp_path / "b.npz", builtin_rest_joints())
+    assert said[0].startswith(f"{tmp_path / 'a.npz'}: is unusual")

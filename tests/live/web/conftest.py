@@ -77,7 +77,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
                 networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,), REMARK)],
                 base=SiteNetwork("base", "AvatarPoser", "random", network()),
                 clips=[clip],
-            ).make(made.folder)
+            ).write(made.folder)
             bare = made.folder / "networks" / f"{RUN}-streaming-fp32-step.onnx.gz"
             made.step.write_bytes(gzip.decompress(bare.read_bytes()))
     return made

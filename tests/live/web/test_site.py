@@ -17,10 +17,10 @@ from onnx import helper, numpy_helper
 
 from memmlp.common import npm
 from memmlp.common.errors import InputError
-from memmlp.deploy.latency import YARDSTICK_SHAPE, yardstick
+from memmlp.deploy.latency import YARDSTICK_SHAPE, make_yardstick
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.spaces import SPACES
-from memmlp.live.web.site import LEAST, NUMBERS, Site, check_place, pack_clip, randomize_weights
+from memmlp.live.web.site import LEAST, NUMBERS, Site, check_site_folder, pack_clip, randomize_weights
 
 NOTHING = Site(networks=[], base=None, clips=[])
 
@@ -58,11 +58,11 @@ def test_everything_that_the_page_names_is_there_and_nothing_elsewhere(site: Mad
 def test_nothing_else_is_overwritten(tmp_path: Path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(InputError, match="other content"):
-        NOTHING.make(tmp_path)
+        NOTHING.write(tmp_path)
     with pytest.raises(InputError, match="is a file"):
-        check_place(tmp_path / "thesis.tex")
+        check_site_folder(tmp_path / "thesis.tex")
     with pytest.raises(InputError, match="there is no folder"):
-        check_place(tmp_path / "none" / "site")
+        check_site_folder(tmp_path / "none" / "site")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -73,7 +73,7 @@ def test_without_the_packages_an_earlier_site_stays(tmp_path: Path, monkeypatch:
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "site.json").write_text('{"packages": {}}')
     with pytest.raises(InputError, match="onnxruntime-web@"):
-        NOTHING.make(tmp_path / "site")
+        NOTHING.write(tmp_path / "site")
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
     assert [path.name for path in (tmp_path / "site").iterdir()] == ["site.json"]
 
@@ -99,7 +99,7 @@ def test_timed_graphs_have_random_weights_that_compress():
             np.testing.assert_array_equal(values, before)
         else:
             assert values.astype(float).std() == pytest.approx(abs(float(before.flat[0])), rel=0.05)
-    whole = yardstick()
+    whole = make_yardstick()
     given = [whole.SerializeToString()]
     randomize_weights(whole)
     given.append(whole.SerializeToString())
@@ -152,9 +152,15 @@ def test_it_is_the_middle_of_the_clip_in_the_page_s_axes():
     first = (len(PERSON.frames) - 60) // 2
     space, middle = SPACES["openxr"], slice(first + 1, first + 61)  # frames have no first moment
     np.testing.assert_allclose(
-        numbers[:, :9].reshape(-1, 3, 3), space.positions_out(PERSON.positions[middle]), atol=1e-6
+        numbers[:, :9].reshape(-1, 3, 3),
+        space.convert_positions_from_amass(PERSON.positions[middle]),
+        atol=1e-6,
     )
     rotations = quaternion_to_matrix(numbers[:, 9:21].reshape(-1, 4).astype(float)).reshape(-1, 3, 3, 3)
-    np.testing.assert_allclose(rotations, space.rotations_out(PERSON.rotations[middle]), atol=1e-5)
+    np.testing.assert_allclose(
+        rotations, space.convert_rotations_from_amass(PERSON.rotations[middle]), atol=1e-5
+    )
     joints = PERSON.frames[first : first + 60, -66:].reshape(-1, 22, 3).numpy()
-    np.testing.assert_allclose(numbers[:, 21:].reshape(-1, 22, 3), space.positions_out(joints), atol=1e-6)
+    np.testing.assert_allclose(
+        numbers[:, 21:].reshape(-1, 22, 3), space.convert_positions_from_amass(joints), atol=1e-6
+    )

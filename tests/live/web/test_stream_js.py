@@ -28,10 +28,10 @@ HEIGHT = 1.6  # metres, of another person than the network's
 def samples(times: np.ndarray, lost: dict[int, tuple[int, ...]] | None = None) -> list[dict[str, Any]]:
     """A person's trackers at times, some of them lost, as the page takes them."""
     person = wearer.person(times - times[0])
-    positions = SPACE.positions_out(person.positions)
-    rotations = matrix_to_quaternion(SPACE.rotations_out(person.rotations).reshape(-1, 3, 3)).reshape(
-        -1, 3, 4
-    )
+    positions = SPACE.convert_positions_from_amass(person.positions)
+    rotations = matrix_to_quaternion(
+        SPACE.convert_rotations_from_amass(person.rotations).reshape(-1, 3, 3)
+    ).reshape(-1, 3, 4)
     made = []
     for index, time in enumerate(times):
         gone = (lost or {}).get(index, ())

@@ -12,7 +12,7 @@ import tiny
 from PIL import Image
 
 from memmlp.common.errors import InputError
-from memmlp.evaluation.modes import joint_positions
+from memmlp.evaluation.modes import extract_positions
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.report.pictures import clip_pictures
 from memmlp.report.pictures.clip_pictures import (
@@ -23,7 +23,7 @@ from memmlp.report.pictures.clip_pictures import (
     write_picture,
 )
 
-TRUTH = joint_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
+TRUTH = extract_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 OFF = np.array([0.0, 0.0, 0.08])
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import tiny
 
-from memmlp.evaluation.modes import joint_positions
+from memmlp.evaluation.modes import extract_positions
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.report.pictures.clip_pictures import ClipPiece
 from memmlp.report.pictures.drawing import Camera, draw_skeleton, fix_layout, get_pixels, make_panels
 
-TRUTH = joint_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
+TRUTH = extract_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 WIDTH, HEIGHT = 120, 180
 
 

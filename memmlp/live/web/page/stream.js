@@ -1,5 +1,5 @@
-// A trained network that is fed live: three trackers' poses in, a body's pose out, as memmlp.live.stream.Stream and
-// memmlp.live.tracker_resampling, rule by rule; tests/live/web/test_stream_js.py compares them.
+// A trained network that runs on live trackers. It follows the same rules as memmlp.live.stream.Stream and
+// memmlp.live.tracker_resampling; tests/live/web/test_stream_js.py compares them.
 //
 // Everything is in OpenXR's frame of reference: metres, Y up, -Z forward; a rotation is a quaternion, the identity for a
 // person in T-pose who looks along -Z. A sample is { time, positions, rotations } of head, left and right wrist. `run` does
@@ -40,7 +40,7 @@ function tPose(body, place, heading) {
   return { time: 0, positions, rotations: EACH.map(() => turn) };
 }
 
-// The sample with lost trackers at their last poses, as seen from the head.
+// Return the sample with lost trackers at their last poses relative to the head.
 function holdLost(sample, lost, last) {
   const [positions, rotations] = [[...sample.positions], [...sample.rotations]];
   if (lost[0]) [positions[0], rotations[0]] = [last.positions[0], last.rotations[0]];
@@ -52,7 +52,7 @@ function holdLost(sample, lost, last) {
   return { time: sample.time, positions, rotations };
 }
 
-// Turns samples of three trackers into frames at the network's rate; lost trackers are held.
+// Converts samples of three trackers to frames at the network's rate, and holds lost trackers.
 class TrackerFrames {
   constructor(body, fps) {
     Object.assign(this, { body, fps });
@@ -134,7 +134,7 @@ export class Stream {
     this.reset();
   }
 
-  // Restart: the next sample is the first. Its frame still waits for those in progress.
+  // Restart. The next sample counts as the first sample. Its frame waits for the frames in progress.
   reset() {
     this.trackers.reset();
     const forget = () => null;
@@ -180,15 +180,15 @@ export class Stream {
   calibrate(head, left, right, scale = this.scale) {
     const devices = [head, left, right].map(read);
     const missing = TRACKERS.filter((_, i) => devices[i].lost);
-    if (missing.length) throw new Error(`lost ${missing.join(', ')}; all three trackers are needed`);
+    if (missing.length) throw new Error(`needs all three trackers; lost: ${missing.join(', ')}`);
     const world = devices.map(device => scaled(device.position, scale));
     const across = minus(world[1], world[2]);
-    if (Math.hypot(across[0], across[2]) < APART) throw new Error('the hands are not apart; stand in T-pose, the arms to the sides');
+    if (Math.hypot(across[0], across[2]) < APART) throw new Error('the hands are not apart; stand in a T-pose with the arms to the sides');
     const heading = Math.atan2(across[2], -across[0]);
     const { rotation } = devices[0];
     const upright = rotate(rotation, [0, 1, 0])[1] > Math.cos(TILTED);
     if (upright && Math.cos(headingOf(rotation) - heading) < 0) {
-      throw new Error("the head looks backwards as seen from the hands; are left and right exchanged, or is the head's device mounted backwards?");
+      throw new Error("the head looks backwards relative to the hands; check that left and right are not exchanged, and the head's device");
     }
     const pose = tPose(this.body, world[0], heading);
     const away = EACH.map(axis => EACH.reduce((sum, i) => sum + (world[i][axis] - pose.positions[i][axis]) / 3, 0));
@@ -201,7 +201,7 @@ export class Stream {
     const farthest = Math.max(...distances);
     if (farthest > FAR) {
       const name = TRACKERS[distances.indexOf(farthest)];
-      throw new Error(`${name} is ${(100 * farthest).toFixed(0)} cm from its joint in a T-pose; stand upright, arms straight to the sides`);
+      throw new Error(`${name} is ${(100 * farthest).toFixed(0)} cm from its joint in a T-pose; stand upright with straight arms to the sides`);
     }
     Object.assign(this, { offsets, scale });
     this.reset();
@@ -213,9 +213,9 @@ export class Stream {
 function read(tracker, index) {
   if (!tracker) return NEUTRAL;
   const numbers = [...tracker.position, ...tracker.rotation];
-  if (numbers.length !== 7) throw new Error(`${TRACKERS[index]}: expected a position of 3 and a rotation of 4 numbers`);
+  if (numbers.length !== 7) throw new Error(`${TRACKERS[index]}: must be a position of 3 numbers and a rotation of 4 numbers`);
   const norm = Math.hypot(...tracker.rotation);
   if (norm === 0 || !numbers.every(x => Math.abs(x) <= FARTHEST)) return NEUTRAL;
-  if (Math.abs(norm - 1) > UNIT) throw new Error(`${TRACKERS[index]}: a quaternion of norm ${norm.toPrecision(3)}; must be 1`);
+  if (Math.abs(norm - 1) > UNIT) throw new Error(`${TRACKERS[index]}: quaternion has norm ${norm.toPrecision(3)}; must be 1`);
   return { position: [...tracker.position], rotation: scaled(tracker.rotation, 1 / norm), lost: false };
 }
