@@ -53,16 +53,16 @@ from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
     AGRoLLoss,
     AvatarPoserLoss,
-    HandFK,
-    HandPosition,
+    KinematicHandTerm,
     Loss,
     LossOfNetwork,
-    Manual,
+    ManualWeights,
     MotionLoss,
-    NoHand,
+    NoHandTerm,
+    PositionHandTerm,
     RPMLoss,
     TermsLoss,
-    Uncertainty,
+    UncertaintyWeights,
 )
 from memmlp.training.losses.baseline_losses import AGRoLLossSettings, AvatarPoserLossSettings
 from memmlp.training.losses.terms import ERRORS, TERMS
@@ -193,7 +193,7 @@ def weighted(make: Callable[[], Loss]) -> Numbers:
     return found | {f"weight {name}": value for name, value in one.weighting.weights().items()}
 
 
-def hand(term: NoHand | HandPosition | HandFK) -> Numbers:
+def hand(term: NoHandTerm | PositionHandTerm | KinematicHandTerm) -> Numbers:
     predicted, true = pair()
     terms = term(
         predicted[..., SPARSE_DIM:], true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.normalizer(World())
@@ -308,8 +308,8 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "rollout.teacher_forcing": partial(rollout, TeacherForcing),
     "rollout.own_predictions": partial(rollout, partial(OwnPredictions, 2)),
     "rollout.streams": partial(rollout, partial(PersistentStreams, 4)),
-    "loss.uncertainty": partial(weighted, lambda: MotionLoss(Uncertainty(0.01), NoHand(), BOTH)),
-    "loss.manual": partial(weighted, lambda: MotionLoss(Manual(), NoHand(), BOTH)),
+    "loss.uncertainty": partial(weighted, lambda: MotionLoss(UncertaintyWeights(0.01), NoHandTerm(), BOTH)),
+    "loss.manual": partial(weighted, lambda: MotionLoss(ManualWeights(), NoHandTerm(), BOTH)),
     "loss.agrol": lambda: {
         f"{error} {name}": value
         for error in ("norm", "square")
@@ -332,9 +332,9 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "weighting.learned": partial(
         weighted, partial(TermsLoss, weighting="learned", rotation=2.0, velocity=30.0)
     ),
-    "hand.position": lambda: hand(HandPosition()),
-    "hand.fk": lambda: hand(HandFK()),
-    "hand.off": lambda: hand(NoHand()),
+    "hand.position": lambda: hand(PositionHandTerm()),
+    "hand.fk": lambda: hand(KinematicHandTerm()),
+    "hand.off": lambda: hand(NoHandTerm()),
     "metrics": measured,
     "mode.stream": partial(mode, "stream"),
     "mode.window": partial(mode, "window"),

@@ -17,12 +17,12 @@ from memmlp.networks.refiner import SAGERefinerSettings
 from memmlp.networks.sage_parts import LATENT, ProductQuantiser
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.loop import seed_step, train_step
-from memmlp.training.losses import Fixed, Loss, Terms
-from memmlp.training.optim import Optim, vqvae_optim
+from memmlp.training.losses import FixedWeights, Loss, Terms
+from memmlp.training.optim import Optim, make_vqvae_optim
 from memmlp.training.rollout import TeacherForcing
 from memmlp.training.train_network import MotionTask, VQVAETask
 from memmlp.training.train_refiner import LOSSES, RefinerTask, RefinerTraining
-from memmlp.training.train_sage import PARTS, DroppingOptim, PartTask
+from memmlp.training.train_sage import PARTS, DroppingOptim, SAGEPartTask
 
 ROUNDED = ("quantiser.vectors", "key.bias")
 """Parameters that follow a processor's rounding: the nearest of similar codes, and attention's key biases,
@@ -54,12 +54,12 @@ def vqvae(codebook: str = "ema") -> Numbers:
     """Three training steps, then validation."""
     torch.manual_seed(3)
     model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
-    optim = vqvae_optim(3, batch=16, lr=1e-3, weight_decay=0.1)
+    optim = make_vqvae_optim(3, batch=16, lr=1e-3, weight_decay=0.1)
     task = VQVAETask(model, tiny.normalizer(), frames(), frames(), optim, seed=0)
     return _trained(task, optim) | task.validate()
 
 
-def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim) -> Numbers:
+def _trained(task: VQVAETask | MotionTask | RefinerTask | SAGEPartTask, optim: Optim) -> Numbers:
     """The losses of three steps, and the weights after them."""
     optimiser, found = optim.build(task.parameter_groups()), {}
     average = optim.make_average(task.module, optimiser)
@@ -68,7 +68,7 @@ def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim
         result = train_step(task, optim, optimiser, step)
         average.update(step + 1)
         found |= {f"{name} {step}": float(term.detach()) for name, term in result.terms.items()}
-    average.put_in_place()
+    average.write_into_module()
     named = task.module.named_parameters()
     weights = torch.cat([p.detach().flatten() for name, p in named if not name.endswith(ROUNDED)])
     return found | summary("weights", weights)
@@ -96,7 +96,7 @@ class Squares(Loss):
 
     def __init__(self) -> None:
         super().__init__()
-        self.weighting = Fixed({"square": 2.0})
+        self.weighting = FixedWeights({"square": 2.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         return {"square": (motion - truth).square().mean()}

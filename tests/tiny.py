@@ -23,7 +23,7 @@ from memmlp.networks.motion_model import MotionModel, WindowlessModel
 from memmlp.networks.own_past_memory import CodeMemory, CodeMemorySettings, JointCodeMemory
 from memmlp.networks.predictor import TwoBranchSettings
 from memmlp.networks.recurrent_poser import RecurrentPoser, RecurrentPoserSettings
-from memmlp.networks.refiner import Refined
+from memmlp.networks.refiner import RefinedModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, LossOfNetwork, RPMLoss, TermsLoss
 
@@ -186,8 +186,8 @@ def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) 
     return RecurrentPoser(normalizer(coordinates), RecurrentPoserSettings(**settings | changes)).eval()
 
 
-def refined(network: MotionModel | None = None) -> Refined:
+def refined(network: MotionModel | None = None) -> RefinedModel:
     """Make a network with a tiny refiner of random weights behind it, in evaluation mode."""
     network = network or model(coordinates=Heading())
     torch.manual_seed(1)
-    return Refined(network, width=6, depth=2).eval()
+    return RefinedModel(network, width=6, depth=2).eval()

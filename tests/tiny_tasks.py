@@ -13,11 +13,11 @@ from memmlp.networks.own_past_memory import JointCodeMemory
 from memmlp.networks.sage_parts import LOWER, UPPER
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
-from memmlp.training.losses import HandPosition, MotionLoss, TermsLoss, Uncertainty
+from memmlp.training.losses import MotionLoss, PositionHandTerm, TermsLoss, UncertaintyWeights
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
 from memmlp.training.train_network import MotionTask, NetworkTraining, VQVAETask
-from memmlp.training.train_sage import PARTS, PartTask, make_objective
+from memmlp.training.train_sage import PARTS, SAGEPartTask, make_objective
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
 ROLLOUTS = {
@@ -31,7 +31,7 @@ def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0, **cha
     model, made = tiny.model(seed=seed, **changes), ROLLOUTS[rollout]()
     if isinstance(made, PersistentStreams):
         made.begin(model)
-    loss = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    loss = MotionLoss(UncertaintyWeights(), PositionHandTerm(), model.predictor.branches)
     return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
 
 
@@ -53,7 +53,7 @@ def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
     return VQVAETask(model, tiny.normalizer(), tiny.frames(), tiny.frames((30,), seed=9), optim, seed=0)
 
 
-def part_task(kind: str, optim: Optim = OPTIM, seed: int = 0) -> PartTask:
+def part_task(kind: str, optim: Optim = OPTIM, seed: int = 0) -> SAGEPartTask:
     """The task of training one of SAGE-Net's parts; those before it have random weights."""
     net = tiny.baseline("sage", seed=seed)
     halves = nn.ModuleDict(
@@ -63,7 +63,7 @@ def part_task(kind: str, optim: Optim = OPTIM, seed: int = 0) -> PartTask:
     network = NetworkTraining(seed, lambda branches: TermsLoss(angle=1), TeacherForcing(), optim, "frames")
     halves.requires_grad_(False)
     objective, validation = make_objective(kind, halves), tiny.frames((30,), seed=9)
-    return PartTask(part.requires_grad_(True), objective, network, tiny.frames(), validation, net.frames)
+    return SAGEPartTask(part.requires_grad_(True), objective, network, tiny.frames(), validation, net.frames)
 
 
 def weights(run: Run) -> dict[str, torch.Tensor]:

@@ -85,7 +85,7 @@ def export_all(
     from memmlp.deploy.latency import strip_conversions
     from memmlp.deploy.lower_precision import write_lower_precision
     from memmlp.motion.body import FRAME_DIM
-    from memmlp.networks.streaming import has_stream, streaming
+    from memmlp.networks.streaming import has_streaming_graph, streaming
 
     clips = [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
     for name in progress_bar(models, "exporting"):
@@ -95,7 +95,7 @@ def export_all(
         files = {graph: folder / f"{name}.{graph}.onnx" for graph in GRAPHS}
         export(strip_conversions(model), files["network"], "random")
         export(model, files["naive"], "random")
-        if has_stream(model):
+        if has_streaming_graph(model):
             stream = streaming(model)
             export(stream, files["streaming"], "random")
             for precision in LOWER:

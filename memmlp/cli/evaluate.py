@@ -53,7 +53,7 @@ def evaluate(
     from memmlp.common.files import write_json
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
-    from memmlp.training.request import clip_rows
+    from memmlp.training.request import read_clip_rows
     from memmlp.training.run_stages import complete_stages
 
     found = open_run(outputs, run, device, overrides)
@@ -67,7 +67,7 @@ def evaluate(
     for table in (metrics_table(results), *source_tables(found.run, experiment.stage_ids)):
         Console(highlight=False).print(table)
     if json_path is not None:
-        write_json(json_path, {"mean": results, "clips": clip_rows(experiment, found.run)})
+        write_json(json_path, {"mean": results, "clips": read_clip_rows(experiment, found.run)})
     if save_predictions is not None:
         write_predictions(experiment.evaluation, found.network(), found.test, save_predictions)
         click.echo(f"predictions of {len(found.test.names)} clips under {save_predictions}")

@@ -171,10 +171,10 @@ def describe_cost(cost: dict[str, Any], precision: str) -> str:
 def load(opened: OpenedRun, form: Form) -> tuple[MotionModel, MotionModel | StreamingGraph]:
     """Return a run's trained network, and the graph of it to export."""
     from memmlp.deploy.deployment import GRAPHS
-    from memmlp.networks.streaming import check_streams
+    from memmlp.networks.streaming import check_is_stream
 
     model = opened.network()
-    check_streams(model)
+    check_is_stream(model)
     return model, GRAPHS[form.graph](model)
 
 

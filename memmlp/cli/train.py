@@ -142,11 +142,11 @@ def run_training(cfg: DictConfig) -> Outcome | None:
     """
     from memmlp.cli.train_summary import show
     from memmlp.config.build_request import build_request
-    from memmlp.training.request import finished_outcome
+    from memmlp.training.request import find_finished_outcome
 
     outcome = None
     if distributed.world_size() == 1:
-        outcome = finished_outcome(build_request(cfg))  # needs no torch
+        outcome = find_finished_outcome(build_request(cfg))  # needs no torch
     if outcome is None:
         from memmlp.config.build import build_experiment
         from memmlp.training.devices import use_threads

@@ -244,7 +244,7 @@ def summary(setup: Setup, study: Study) -> None:
     from memmlp.sweep.search.progress_table import add_row, count_trials, figures, trials_table
     from memmlp.sweep.search.results import IMPORTANCE, boundary_warnings, importances, too_few_trials
     from memmlp.sweep.search.study import trial_values
-    from memmlp.training.request import partial_words
+    from memmlp.training.request import describe_missing_data
 
     console = Console(highlight=False)
     best = study.best()
@@ -262,7 +262,7 @@ def summary(setup: Setup, study: Study) -> None:
         click.echo(line)
     click.echo(count_trials(study))
     request = _requests(setup, {})[0]
-    if part := partial_words(request.config, request.motion.prepare()):
+    if part := describe_missing_data(request.config, request.motion.prepare()):
         click.echo(f"on a part of the data: {part}")
     click.echo(f"in {setup.folder}")
     if best:

@@ -83,12 +83,12 @@ def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     """Return a run's network in the form that a site needs."""
     from memmlp.live.web.site import SiteNetwork
-    from memmlp.networks.streaming import check_streams
+    from memmlp.networks.streaming import check_is_stream
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import count_training_frames, get_run_name, warn_if_hardly_trained
 
     network = opened.network()
-    check_streams(network)
+    check_is_stream(network)
     run, config = opened.run, flatten(opened.run.config)
     name, model = get_run_name(run.manifest, config).removeprefix("default · "), config["model.name"]
     name = name if f"model={model}" in name else f"{model} {name}"

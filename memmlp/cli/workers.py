@@ -106,9 +106,9 @@ class Workers:
             if local and name == "cuda" and not gpus:
                 raise InputError("device=cuda: no GPU is visible here; use device=cpu or device=auto")
         if gpus:
-            from memmlp.training.devices import missing_gpu
+            from memmlp.training.devices import describe_missing_gpu
 
-            if line := missing_gpu():
+            if line := describe_missing_gpu():
                 raise InputError(line)
         return divide_gpus(gpus, self.gpus_per_worker)
 

@@ -35,9 +35,9 @@ from memmlp.runs.identity import VQVAE_SHAPE
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
-from memmlp.training.devices import device
+from memmlp.training.devices import choose_device
 from memmlp.training.losses import Loss, MotionLoss, Term
-from memmlp.training.optim import Optim, vqvae_optim
+from memmlp.training.optim import Optim, make_vqvae_optim
 from memmlp.training.run_stages import Experiment
 from memmlp.training.train_network import NetworkTraining, Training, VQVAETraining
 from memmlp.training.train_refiner import RefinerTraining
@@ -64,7 +64,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
     return Experiment(
         config=request.config,
         motion=request.motion,
-        device=torch.device("cpu") if elsewhere else device(cfg.device),
+        device=torch.device("cpu") if elsewhere else choose_device(cfg.device),
         architecture=build_architecture(cfg),
         prerequisites=build_prerequisites(cfg, request.config),
         training=build_training(cfg, metrics),
@@ -240,7 +240,7 @@ def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
     own = cfg.vqvae
     keys = {name: own[name] for name in ("batch", "lr", "weight_decay")}
     keys |= {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
-    return vqvae_optim(own.steps or math.ceil(own.epochs * frames / own.batch), **keys)
+    return make_vqvae_optim(own.steps or math.ceil(own.epochs * frames / own.batch), **keys)
 
 
 def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:

@@ -148,9 +148,9 @@ def _requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[tuple[i
 
 def tasks_of(request: RunRequest, data: str) -> list[RunTask]:
     """Return the runs that a request needs on data with this digest, its own run last."""
-    from memmlp.training.request import without_refiner
+    from memmlp.training.request import remove_refiner
 
-    bare = without_refiner(request.config) if request.config["refiner"] is not None else request.config
+    bare = remove_refiner(request.config) if request.config["refiner"] is not None else request.config
     *before, own = request.identities(data)
     tasks: list[RunTask] = []
     for one in before:

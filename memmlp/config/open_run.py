@@ -21,7 +21,7 @@ from memmlp.networks.motion_model import MotionModel
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, select_training_config
 from memmlp.runs.lookup import find_run
 from memmlp.runs.run import Run
-from memmlp.training.devices import device
+from memmlp.training.devices import choose_device
 from memmlp.training.run_stages import Experiment
 
 ACTING = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
@@ -80,7 +80,7 @@ def data_of(run: Run, experiment: Experiment) -> Prepared:
 def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Experiment:
     """Return the experiment of a finished run, without its data; raises InputError as `open_run` does."""
     experiment = replace(
-        build_experiment(config_of(run, overrides), elsewhere=True), device=device(device_name)
+        build_experiment(config_of(run, overrides), elsewhere=True), device=choose_device(device_name)
     )
     if select_training_config(run.config) != select_training_config(experiment.config):
         words = ", ".join(overrides)

@@ -28,18 +28,18 @@ def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | No
     Returns:
         A line if there is no such GPU and nothing was done; else None.
     """
-    if gpu and (line := missing_gpu()):
+    if gpu and (line := describe_missing_gpu()):
         return line
     wanted = partial(Presence.of, Path(controller)) if controller else partial(has_controller, Path(path))
     work_off(Path(path), partial(perform, Path(path), threads), wanted)
     return None
 
 
-def missing_gpu() -> str | None:
+def describe_missing_gpu() -> str | None:
     """Return a line that says that torch finds no GPU in a worker that should have one; None if it does."""
     from memmlp.training import devices  # it imports torch
 
-    return devices.missing_gpu()
+    return devices.describe_missing_gpu()
 
 
 def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:

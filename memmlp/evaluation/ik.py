@@ -23,7 +23,7 @@ from memmlp.motion.geometry import (
     sixd_to_matrix,
 )
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.limb_solver import reach_hands, use_tracker_rotations
+from memmlp.networks.limb_solver import bend_arms_to_trackers, use_tracker_rotations
 
 Objective = Callable[[Tensor, Tensor], Tensor]
 
@@ -100,7 +100,7 @@ class Arms:
         local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
         rotations, _ = forward_kinematics(local, torch.zeros_like(sparse[:, :3]), normalizer.rest)
         turned = use_tracker_rotations(matrix_to_sixd(rotations).flatten(1), sparse)
-        solved = normalizer.posed_in_world(turned, sparse, reach_hands)
+        solved = normalizer.posed_in_world(turned, sparse, bend_arms_to_trackers)
         return {"combined": torch.cat([solved[:, ROTATION], motion[:, POSITION]], -1)}
 
 

@@ -1,8 +1,7 @@
 """AGRoL (Du et al., CVPR 2023): the MLP, and the diffusion model whose denoiser is that MLP.
 
-Both take a window of inputs and predict the rotations of all its frames; a live stream keeps the last frame.
-The paper's sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of
-`memmlp.networks.layers.MLPBlock`.
+Both predict the rotations of all frames of a window from its inputs. A live stream keeps the last frame. The
+paper's sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of `memmlp.networks.layers.MLPBlock`.
 """
 
 from __future__ import annotations
@@ -43,11 +42,11 @@ class AGRoLMLPGraph(StemGraph):
         return self.model.stem(encoded)
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
-        """Apply the blocks to (T, d), the last block for the newest frame alone, then the head: (1, 132)."""
+        """Apply blocks and head to (T, d); the last block computes only the newest frame (1, 132)."""
         *earlier, last = self.blocks
         for block in earlier:
             window = block(window)
-        return self.model.head(last.newest(window, 1))
+        return self.model.head(last.compute_newest(window, 1))
 
 
 @component("model", "agrol_mlp", builds="AGRoLMLP")
@@ -55,9 +54,9 @@ class AGRoLMLPGraph(StemGraph):
 class AGRoLMLPSettings(NetworkSettings):
     """AGRoL's MLP (Du et al. 2023), which predicts whole windows; a stream keeps the last frame.
 
-    Loss, depth and features are those of its released code. Training is this project's: AdamW in place of
-    Adam, final_lr 1e-5 in place of 3e-5, and what the profile sets (profile=paper has its authors' batch and
-    rates).
+    Loss, depth and features follow its released code. The training settings differ: AdamW instead of Adam,
+    final_lr 1e-5 instead of 3e-5, and the profile's values. profile=paper has the authors' batch size and
+    learning rates.
     """
 
     frames: int = setting(at_least(2), tiny=11, small=196, paper=196)  # T, the frames of a window
@@ -90,7 +89,7 @@ class AGRoLMLP(WindowModel):
 
 
 class TimedBlock(MLPBlock):
-    """An MLP block whose input is shifted by a projection of the diffusion time's embedding."""
+    """An MLP block that adds a projection of the diffusion time's embedding to its input."""
 
     def __init__(self, width: int, frames: int):
         super().__init__(width, frames)
@@ -101,7 +100,7 @@ class TimedBlock(MLPBlock):
 
         Args:
             h: hidden state (B, T, d).
-            past: the embedding (B, d) of the diffusion time; it is passed where other blocks get the past.
+            past: the embedding (B, d) of the diffusion time; other blocks receive the past in this argument.
         """
         assert isinstance(past, Tensor)
         return super().forward(h + self.time(F.silu(past))[:, None])
@@ -110,8 +109,7 @@ class TimedBlock(MLPBlock):
 class AGRoLDiffusionGraph(StemGraph):
     """The streaming graph of AGRoL's diffusion model.
 
-    The shift that each block adds for the diffusion time is the same at every step of a stream, so it is
-    computed once.
+    Each block's shift for the diffusion time is the same at every step of a stream, so it is computed once.
     """
 
     model: AGRoLDiffusion
@@ -133,7 +131,7 @@ class AGRoLDiffusionGraph(StemGraph):
         return F.linear(encoded, self.model.stem.weight[:, ROTATION.stop :], self.model.stem.bias)
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
-        """Sample by DDIM; the denoiser's last call computes the newest frame (1, 132) alone."""
+        """Sample by DDIM; the denoiser's last call computes only the newest frame (1, 132)."""
         diffusion, noisy = self.model.diffusion, self.model.noise
         for index in range(len(diffusion.times) - 1):
             noisy = diffusion.step(noisy, self._denoised(noisy, window, index, self.frames), index)
@@ -144,18 +142,18 @@ class AGRoLDiffusionGraph(StemGraph):
         h = window + F.linear(noisy, self.model.stem.weight[:, : ROTATION.stop])
         *earlier, last = zip(self.blocks, self.shifts[index], strict=True)
         for block, shift in earlier:
-            h = block.newest(h + shift, self.frames)
+            h = block.compute_newest(h + shift, self.frames)
         block, shift = last
-        return self.model.head(block.newest(h + shift, count))
+        return self.model.head(block.compute_newest(h + shift, count))
 
 
 @component("model", "agrol_diffusion", builds="AGRoLDiffusion")
 @dataclass
 class AGRoLDiffusionSettings(AGRoLMLPSettings):
-    """AGRoL's diffusion model (Du et al. 2023), which makes the rotations of a window from noise, by DDIM.
+    """AGRoL's diffusion model (Du et al. 2023), which generates a window's rotations from noise by DDIM.
 
-    Loss, depth, noise schedule and features are those of its released code, which normalises the motion but
-    not the inputs. Training is this project's: AdamW in place of Adam, final_lr, and what the profile sets.
+    Loss, depth, noise schedule and features follow its released code, which normalises the motion but not the
+    inputs. The training settings differ: AdamW instead of Adam, final_lr, and the profile's values.
     """
 
     # d, the width of the hidden state
@@ -173,13 +171,13 @@ class AGRoLDiffusion(WindowModel):
 
     It has 7,480,436 parameters at the paper's sizes (7.48 M in Table 16): the MLP's blocks and head
     (3,707,508), a linear layer of each block for the time's embedding (12 x 262,656), the embedding's own two
-    linear layers (525,312), and a stem for noisy motion and inputs side by side (95,744). The paper says that
-    the embedding enters every block. That two layers come before is our reading of its parameter count; the
-    released code differs, with as many parameters in linear layers for motion and inputs (docs/readings.md).
+    linear layers (525,312), and a stem for concatenated noisy motion and inputs (95,744). The paper says that
+    the embedding enters every block. The two layers before the blocks follow from the paper's parameter
+    count. The released code has the same number of parameters in linear layers for motion and inputs instead
+    (docs/readings.md).
 
-    The noise that sampling starts from is always the same, drawn from `noise_seed`: sampling is then a
-    function of the inputs alone, in torch as in ONNX, and consecutive windows of a stream do not differ by
-    their noise.
+    Sampling always starts from the same noise, drawn with `noise_seed`. Its result therefore depends only on
+    the inputs, in torch and in ONNX, and consecutive windows of a stream share their noise.
     """
 
     graph = AGRoLDiffusionGraph
@@ -217,7 +215,7 @@ class AGRoLDiffusion(WindowModel):
         return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call: add noise to the truth, and denoise it in one call; see MotionModel.
+        """Add noise to the truth, and denoise it in one denoiser call; see MotionModel.
 
         A diffusion time is drawn for each window.
         """

@@ -1,4 +1,4 @@
-"""How the network of a config is built, begins its training, and is loaded with trained weights."""
+"""Build a config's network, prepare it for training, and load its trained weights."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from memmlp.networks.vqvae import VQVAE
 
 @dataclass(frozen=True)
 class Architecture:
-    """How a network is built, with the VQ-VAE that it may use and the refiner that may follow it.
+    """The parts of a network: its factory, and optionally a VQ-VAE and a refiner.
 
     Attributes:
-        coordinates: the coordinates in which the network sees the world.
+        coordinates: the coordinate system of the network's inputs and outputs.
         normalize: whether features are normalised to z-scores.
-        vqvae: makes a VQ-VAE with fresh weights.
-        network: makes the network with fresh weights, given its normalizer and the frozen VQ-VAE, if any.
+        vqvae: makes a VQ-VAE with random weights.
+        network: makes the network with random weights, given its normalizer and the frozen VQ-VAE or None.
         uses_codes: whether the network needs a frozen VQ-VAE.
-        trained_parts: names of the parts that a prerequisite run trained and that stay frozen; empty where
-            all parts are trained further, None for a network whose parts are not trained beforehand.
-        refiner: the settings of the refiner behind the network; None for none.
+        trained_parts: names of the parts from a prerequisite run that stay frozen. If empty, all parts are
+            trained further. None for a network without such a prerequisite run.
+        refiner: the settings of the refiner behind the network; None without a refiner.
     """
 
     coordinates: Coordinates
@@ -43,24 +43,24 @@ class Architecture:
     refiner: SAGERefinerSettings | None = None
 
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MotionModel:
-        """Build the network with fresh weights.
+        """Build the network with random weights.
 
         Args:
             normalizer: converts between the world and network space.
-            codes: the frozen VQ-VAE, where the network uses one.
+            codes: the frozen VQ-VAE; None if the network does not use one.
         """
         model = self.network(normalizer, codes)
         return self.refiner.build(model) if self.refiner else model
 
     def build_for_training(self, normalizer: Normalizer, prerequisite: Path | None) -> MotionModel:
-        """Build the network as its training begins, without its refiner.
+        """Build the network for the start of its training, without its refiner.
 
         Args:
             normalizer: converts between the world and network space.
-            prerequisite: file of the weights of the prerequisite run; None for a network without one.
+            prerequisite: weights file of the prerequisite run; None without a prerequisite run.
 
         Raises:
-            InputError: if the file of weights is damaged.
+            InputError: if the weights file is damaged.
         """
         tensors = checkpoint.read(prerequisite)[0] if prerequisite else {}
         if self.trained_parts is None:
@@ -77,14 +77,14 @@ class Architecture:
         return model
 
     def make_normalizer(self, manifest: Manifest, frames: Tensor) -> Normalizer:
-        """Make the normalizer, with the statistics of the training frames (F, 252) if `normalize` is set."""
+        """Make the normalizer; with `normalize`, it uses the statistics of the training frames (F, 252)."""
         rest = torch.as_tensor(np.asarray(manifest.rest), dtype=torch.float32)
         if self.normalize:
             return Normalizer.fit(self.coordinates, rest, frames)
         return Normalizer.raw(self.coordinates, rest)
 
     def load(self, weights: Path) -> MotionModel:
-        """Load a trained network from a file of weights.
+        """Load a trained network from a weights file.
 
         Raises:
             InputError: if the file is damaged.

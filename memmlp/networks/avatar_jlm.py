@@ -1,4 +1,4 @@
-"""AvatarJLM (Zheng et al., ICCV 2023): joint-level tokens, attended over joints and over time."""
+"""AvatarJLM (Zheng et al., ICCV 2023): attention over joint-level tokens, across joints and across time."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from memmlp.networks.streaming import StemGraph
 from memmlp.networks.transformer import EncoderLayer, draw_weights, make_encoder
 
 JOINT_DIM = 18  # features of a joint: rotation, angular velocity, position, velocity
-UNSEEN = 0.01  # stands in all features of joints without a tracker
+UNTRACKED_FEATURE = 0.01  # stands in all features of joints without a tracker
 TOKENS = 2 * N_JOINTS + 1  # positions, rotations, and the inputs as a whole
-LONGEST = 200  # frames that have a place of their own, as published
+MAX_EMBEDDED_FRAMES = 200  # frames that have a place of their own, as published
 GROUPS = 8  # of the regressor's normalisation
 TRACKER_FEATURES = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
 
@@ -46,22 +46,22 @@ def group_by_tracker(encoded: Tensor) -> Tensor:
 def spread_over_joints(encoded: Tensor) -> Tensor:
     """Spread inputs (..., 54) over the joints (..., 22 x 18); joints without a tracker hold a constant."""
     trackers = group_by_tracker(encoded)
-    unseen = torch.full_like(trackers[..., :1, :], UNSEEN)
+    unseen = torch.full_like(trackers[..., :1, :], UNTRACKED_FEATURE)
     seen = dict(zip(TRACKED, trackers.split(1, -2), strict=True))
     rows = [seen.get(joint, unseen) for joint in range(N_JOINTS)]
     return torch.cat(rows, -2).flatten(-2)
 
 
 def replace_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
-    """Return features of all joints (..., 22, n), those of the tracked joints replaced by (..., 3, n)."""
+    """Return joint features (..., 22, n) with the tracked joints replaced by `tracked` (..., 3, n)."""
     rows = list(joints.unbind(-2))
     for joint, row in zip(TRACKED, tracked.unbind(-2), strict=True):
         rows[joint] = row
     return torch.stack(rows, -2)
 
 
-def apply_layer(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
-    """Apply an encoder layer to (N, n, d), which attends to (N, m, d), written as plain matrix products."""
+def apply_to_batch(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
+    """Apply an encoder layer to `h` (N, n, d) with attention to `seen` (N, m, d), by matrix products."""
     attention, flat, all_seen = layer.attention, h.flatten(0, 1), seen.flatten(0, 1)
     query = attention.query(flat).view(h.shape)
     key, value = (part(all_seen).view(seen.shape) for part in (attention.key, attention.value))
@@ -71,8 +71,8 @@ def apply_layer(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
 class AvatarJLMGraph(StemGraph):
     """AvatarJLM's streaming graph, which carries the tokens of each frame, without position embeddings.
 
-    The tokens' position embeddings change at every step and attention looks both ways in time, so all layers
-    are recomputed; the last one, over time, is only computed for the newest frame.
+    Position embeddings change at every step, and attention looks both ways in time, so all layers are
+    recomputed. The last layer, over time, computes only the newest frame.
     """
 
     float32_modules = ("model.embedding", "model.coarse", "model.regressor")
@@ -87,15 +87,15 @@ class AvatarJLMGraph(StemGraph):
         return self.model.make_tokens(encoded).flatten(1)
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
-        h = self.model.add_places(window.unflatten(-1, (TOKENS, -1)))
+        h = self.model.add_position_embeddings(window.unflatten(-1, (TOKENS, -1)))
         first = h[:, -1:]
         for index, layer in enumerate(self.layers[:-1]):
             turned = h if index % 2 == 0 else h.transpose(0, 1)
-            made = apply_layer(layer, turned, turned)
-            h = self.model.reset_input_token(made if index % 2 == 0 else made.transpose(0, 1), first)
+            made = apply_to_batch(layer, turned, turned)
+            h = self.model.restore_input_token(made if index % 2 == 0 else made.transpose(0, 1), first)
         by_token = h.transpose(0, 1)
-        newest = apply_layer(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
-        features = self.model.reset_input_token(newest, first[-1:]).flatten(1)
+        newest = apply_to_batch(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
+        features = self.model.restore_input_token(newest, first[-1:]).flatten(1)
         return self.read(self.model.regressor(features), encoded)
 
     def read(self, made: Tensor, encoded: Tensor) -> Tensor:
@@ -108,9 +108,9 @@ class AvatarJLMGraph(StemGraph):
 class AvatarJLMSettings(NetworkSettings):
     """AvatarJLM (Zheng et al. 2023): attention over the joints of a coarse pose, and over time.
 
-    Loss and features are those of its released code; the floor is each window's lowest true joint, which that
-    code finds by clustering. Training is this project's: AdamW with its schedule, in place of Adam at 1e-4, a
-    tenth at 60 K steps.
+    Loss and features follow its released code. The floor is each window's lowest true joint; the released
+    code finds it by clustering. The training settings differ: AdamW with the profile's schedule, instead of
+    Adam at 1e-4 with a drop to a tenth at 60 K steps.
     """
 
     frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
@@ -135,13 +135,13 @@ class AvatarJLMSettings(NetworkSettings):
 
 
 class AvatarJLM(WindowModel):
-    """A coarse pose of each frame, tokens of its joints, encoder layers, and a head on all tokens of a frame.
+    """AvatarJLM: a coarse pose per frame, joint tokens, encoder layers, and a head on all tokens of a frame.
 
     It has 63,807,240 parameters at the paper's sizes (T = 41, d = 512, 6 blocks). It predicts all frames of a
     window; a live stream keeps the last one.
 
     Attributes:
-        outputs: how many numbers are read from the tokens of a frame.
+        outputs: number of outputs per frame.
     """
 
     graph = AvatarJLMGraph
@@ -157,7 +157,9 @@ class AvatarJLM(WindowModel):
         self.position_token, self.rotation_token = nn.Linear(3, settings.width), nn.Linear(6, settings.width)
         self.input_token = nn.Linear(hidden, settings.width)
         self.joint_places = nn.Parameter(torch.empty(TOKENS, settings.width))
-        self.time_places = nn.Parameter(torch.empty(max(LONGEST, settings.frames), 1, settings.width))
+        self.time_places = nn.Parameter(
+            torch.empty(max(MAX_EMBEDDED_FRAMES, settings.frames), 1, settings.width)
+        )
         for places in (self.joint_places, self.time_places):
             nn.init.trunc_normal_(places, std=0.02)
         self.layers = make_encoder(settings, 2 * settings.depth)
@@ -170,7 +172,7 @@ class AvatarJLM(WindowModel):
         draw_weights(self)
 
     def place_coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the coarse pose of embeddings (..., 2 d), in the network's coordinates without z-scores.
+        """Return the coarse pose for embeddings (..., 2 d), in the network's coordinates without z-scores.
 
         Returns:
             Joints (..., 22, 3), metres, relative to the head, and their global 6D rotations (..., 22, 6).
@@ -194,15 +196,15 @@ class AvatarJLM(WindowModel):
         whole = self.input_token(embedded.detach())[..., None, :]
         return torch.cat([self.position_token(positions), self.rotation_token(rotations), whole], -2)
 
-    def add_places(self, tokens: Tensor) -> Tensor:
+    def add_position_embeddings(self, tokens: Tensor) -> Tensor:
         """Add the position embeddings of joints and frames to the tokens (..., T, 45, d) of a window."""
         return tokens + self.joint_places + self.time_places[: tokens.shape[-3]]
 
     @staticmethod
-    def reset_input_token(h: Tensor, first: Tensor) -> Tensor:
-        """Return tokens (..., 45, d) with `first` (..., 1, d) in place of the last, the token of the inputs.
+    def restore_input_token(h: Tensor, first: Tensor) -> Tensor:
+        """Return tokens (..., 45, d) with the last token, the input token, replaced by `first` (..., 1, d).
 
-        `first` is that token before any block. It is detached: no gradient flows through it.
+        `first` is the input token before all blocks. No gradient flows through it.
         """
         return torch.cat([h[..., :-1, :], first.detach()], -2)
 
@@ -210,23 +212,23 @@ class AvatarJLM(WindowModel):
         return self.regress(encoded)
 
     def regress(self, encoded: Tensor) -> Tensor:
-        """Map inputs (B, T, 54) in network space to what the regressor reads from their tokens (B, T, n)."""
-        h = self.add_places(self.make_tokens(encoded))
+        """Map inputs (B, T, 54) in network space to the regressor's outputs (B, T, n)."""
+        h = self.add_position_embeddings(self.make_tokens(encoded))
         first = h[..., -1:, :]
         for index, layer in enumerate(self.layers):
             if index % 2 == 0:
                 h = layer(h.flatten(0, 1)).unflatten(0, encoded.shape[:2])
             else:
                 h = layer(h.transpose(1, 2).flatten(0, 1)).unflatten(0, (-1, TOKENS)).transpose(1, 2)
-            h = self.reset_input_token(h, first)
+            h = self.restore_input_token(h, first)
         return self.regressor(h.flatten(-2).flatten(0, 1)).unflatten(0, encoded.shape[:2])
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call, which adds a loss of the coarse pose; see MotionModel."""
+        """Predict the motion, and add a loss of the coarse pose; see MotionModel."""
         return TrainingOutputs(*self.advance(sparse, state), self.compute_coarse_loss(true_frames))
 
     def compute_coarse_loss(self, true_frames: Tensor) -> dict[str, Tensor]:
-        """Return the mean absolute error of the coarse pose's joints relative to the head, weighted.
+        """Return the weighted mean absolute error of the coarse pose's joints, relative to the head.
 
         Args:
             true_frames: world frames [X | Theta] (B, T, 252).

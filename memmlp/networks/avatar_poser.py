@@ -1,8 +1,9 @@
 """AvatarPoser (Jiang et al., ECCV 2022) and EgoPoser (Jiang et al., ECCV 2024).
 
-A transformer encoder makes a feature of the newest frame, from which its pose is read. EgoPoser sees a fast
-and a slow view of a longer window. AvatarPoser's inverse kinematics of the arms and EgoPoser's mask of hands
-out of sight are left out, as is EgoPoser's head for the body's shape, since all bodies here have the mean.
+A transformer encoder computes a feature of the newest frame, and heads predict the pose from it. EgoPoser
+sees a fast and a slow view of a longer window. Three parts are left out: AvatarPoser's inverse kinematics of
+the arms, EgoPoser's mask for invisible hands, and its head for the body's shape. All bodies here have the
+mean shape.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from memmlp.networks.transformer import EncoderLayer, draw_weights, encode_newes
 ROOT = 6  # components of the root's orientation, the first of the rotations
 
 
-def head(width: int, size: int) -> nn.Module:
+def make_head(width: int, size: int) -> nn.Module:
     """Make two linear layers with a ReLU between them, from `width` to `size`."""
     return nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size))
 
@@ -69,8 +70,8 @@ class AvatarPoserGraph(StemGraph):
 class AvatarPoserSettings(NetworkSettings):
     """AvatarPoser (Jiang et al. 2022): a transformer encoder that predicts the newest frame's rotations.
 
-    Loss, features and initial weights (Kaiming's normal ones, gain 0.2; biases 0) are those of its released
-    code. Training is this project's: AdamW with its schedule, in place of Adam at 1e-4, halved every 60 K
+    Loss, features and initial weights (Kaiming normal, gain 0.2; biases 0) follow its released code. The
+    training settings differ: AdamW with the profile's schedule, instead of Adam at 1e-4, halved every 60 K
     steps.
     """
 
@@ -87,27 +88,27 @@ class AvatarPoserSettings(NetworkSettings):
 
 
 class AvatarPoser(NewestFrameModel):
-    """An embedding, an encoder, and two heads on the newest frame, for the root's orientation and the rest.
+    """AvatarPoser: an embedding, an encoder, and heads for the newest frame's orientation and rotations.
 
     It has 4,124,804 parameters at the paper's sizes (T = 40, d = 256, 8 heads, 3 layers, feed-forward 2048),
-    4.12 M in Table 16. Post-norm, ReLU, dropout 0.1 and the lack of a positional encoding are our readings:
-    the paper names none of them, and its parameter count leaves no room for learned positions.
+    4.12 M in Table 16. Post-norm, ReLU, dropout 0.1 and the missing positional encoding are our readings. The
+    paper does not mention them, and its parameter count excludes learned positions.
 
     Attributes:
-        inputs: how many features of a frame are embedded.
-        rotated: how many joints' rotations are predicted besides the root's.
+        inputs: number of embedded features per frame.
+        rotated_joints: number of joints with predicted rotations besides the root.
     """
 
     graph: ClassVar[type[StreamingGraph] | None] = AvatarPoserGraph
     inputs: ClassVar[int] = SPARSE_DIM
-    rotated: ClassVar[int] = N_JOINTS - 1
+    rotated_joints: ClassVar[int] = N_JOINTS - 1
 
     def __init__(self, normalizer: Normalizer, settings: AvatarPoserSettings):
         super().__init__(normalizer, settings.frames)
         self.embedding = nn.Linear(self.inputs, settings.width)
         self.layers = make_encoder(settings, settings.depth)
-        self.orientation = head(settings.width, ROOT)
-        self.rotation = head(settings.width, 6 * self.rotated)
+        self.orientation = make_head(settings.width, ROOT)
+        self.rotation = make_head(settings.width, 6 * self.rotated_joints)
         draw_weights(self)
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
@@ -128,22 +129,22 @@ PLACES = 2 * len(TRACKED)  # components of the trackers' places on the floor
 
 
 def center_on_head(sparse: Tensor) -> Tensor:
-    """Return inputs (..., 54) with positions on the floor relative to the head in the same frame."""
+    """Return inputs (..., 54) with floor positions relative to the head of the same frame."""
     space = HeadRelative()
     return space.sparse_in(sparse, space.origin(sparse))
 
 
-def select_places(sparse: Tensor) -> Tensor:
-    """Return the trackers' positions on the floor (..., 6), from inputs (..., 54)."""
+def select_floor_positions(sparse: Tensor) -> Tensor:
+    """Return the trackers' floor positions (..., 6) from inputs (..., 54)."""
     return sparse[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))[..., :2].flatten(-2)
 
 
 class EgoPoserGraph(StemGraph):
-    """EgoPoser's streaming graph, which carries each frame's embedding and places on the floor.
+    """EgoPoser's streaming graph, which carries each frame's embedding and floor positions.
 
-    At every step the slow view pairs other frames, so nothing after the embedding can be carried. The
-    movement since the window's first frame enters linearly, so the first frame's contribution is subtracted
-    from the sum.
+    The slow view contains other frames at every step, so only the embedding can be carried. The movement
+    since the window's first frame enters linearly, so the first frame's contribution is subtracted from the
+    sum.
     """
 
     float32_modules = ("model.embedding", "model.orientation", "model.rotation")
@@ -155,7 +156,7 @@ class EgoPoserGraph(StemGraph):
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
         local = center_on_head(encoded)
-        place = select_places(local)
+        place = select_floor_positions(local)
         return torch.cat([self.model.embedding(torch.cat([local, place], -1)), place], -1)
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
@@ -170,8 +171,8 @@ class EgoPoserGraph(StemGraph):
 class EgoPoserSettings(AvatarPoserSettings):
     """EgoPoser (Jiang et al. 2024): AvatarPoser's encoder over a fast and a slow view of a longer window.
 
-    Loss and features are those of its released code, except for the hands' positions, which are its paper's
-    (docs/readings.md). Training is this project's, as AvatarPoser's is.
+    Loss and features follow its released code. The hands' positions follow its paper instead
+    (docs/readings.md). The training settings are the same as for AvatarPoser.
     """
 
     # T, the frames of a window; the encoder sees half as many
@@ -192,13 +193,12 @@ class EgoPoserSettings(AvatarPoserSettings):
 
 
 class EgoPoser(AvatarPoser):
-    """AvatarPoser's encoder over the sum of two views: the window's newer half, and its every second frame.
+    """EgoPoser: AvatarPoser's encoder over the sum of two views, its newer half and every second frame.
 
     It has 4,126,340 parameters at the paper's sizes (T = 80, otherwise AvatarPoser's); the released code has
-    a further layer of 7,808 that nothing uses. Positions are relative to the point of the floor below the
-    head in the same frame, and how far these moved since the window's first frame is appended to each frame's
-    inputs: the head's not at all. In the released code the hands' positions and movements are the world's
-    (docs/readings.md).
+    an unused layer of 7,808 parameters. Positions are relative to the floor point below the head of the same
+    frame. Their movement since the window's first frame is appended to each frame's inputs; for the head it
+    is 0. The released code uses world positions and movements of the hands (docs/readings.md).
     """
 
     graph = EgoPoserGraph
@@ -206,12 +206,12 @@ class EgoPoser(AvatarPoser):
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         local = center_on_head(encoded)
-        moved = select_places(local) - select_places(local[:, :1])
+        moved = select_floor_positions(local) - select_floor_positions(local[:, :1])
         slow, fast = self.make_views(torch.cat([local, moved], -1))
         return self.encode(self.embedding(slow) + self.embedding(fast))
 
     @staticmethod
     def make_views(window: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the slow and the fast view of a window (..., T, n): half of its frames each."""
+        """Return the slow and the fast view of a window (..., T, n), each with half of the frames."""
         slow = window[..., ::2, :]
         return slow, window[..., -slow.shape[-2] :, :]

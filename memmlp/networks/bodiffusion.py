@@ -1,6 +1,7 @@
-"""BoDiffusion (Castillo et al., ICCV 2023): a transformer denoises the rotations of a window.
+"""BoDiffusion (Castillo et al., ICCV 2023): a transformer that denoises the rotations of a window.
 
-As published it is offline: windows that overlap by half are denoised together, and averaged at every step.
+The published network is offline. It denoises half-overlapping windows together, and averages them at every
+step.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from memmlp.common.components import component
 from memmlp.common.settings import at_least, positive, setting
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.diffusion import AncestralDiffusion, Denoised, TimeEmbedding
+from memmlp.networks.diffusion import AncestralDiffusion, DenoiserOutput, TimeEmbedding
 from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.streaming import StemGraph, linear
+from memmlp.networks.streaming import StemGraph, make_linear
 from memmlp.networks.transformer import DiTBlock
 
 SINES = 256  # of the diffusion time
@@ -29,11 +30,11 @@ NOISY = 6  # channels of the noisy motion, a joint's 6D rotation
 
 
 class BoDiffusionGraph(StemGraph):
-    """BoDiffusion's streaming graph, in which successive layers without a non-linearity between are merged.
+    """BoDiffusion's streaming graph, which merges successive linear layers.
 
-    The stem's output for each frame's inputs is carried, in order of time. What the blocks compute from the
-    diffusion times is the same at every step of a stream, so it is computed once. The last denoiser call
-    makes the newest frame alone.
+    It carries the stem's output for each frame's inputs, oldest first. The blocks' modulations by the
+    diffusion times are the same at every step of a stream, so they are computed once. The last denoiser call
+    computes only the newest frame.
     """
 
     float32_modules = ("sparse", "motion", "made")
@@ -49,14 +50,14 @@ class BoDiffusionGraph(StemGraph):
             "modulations", torch.stack([block.modulation(embedding) for block in self.blocks], 1)
         )
         motion, sparse = model.stem.weight.unflatten(-1, (N_JOINTS, -1)).tensor_split([NOISY], -1)
-        self.motion = linear(motion.flatten(1))
-        mixture = model.mix_thirds(torch.eye(SPARSE_DIM).to(sparse)).flatten(1)
-        self.sparse = linear(sparse.flatten(1) @ mixture.T, model.stem.bias)
+        self.motion = make_linear(motion.flatten(1))
+        mixture = model.mix_input_thirds(torch.eye(SPARSE_DIM).to(sparse)).flatten(1)
+        self.sparse = make_linear(sparse.flatten(1) @ mixture.T, model.stem.bias)
         head = model.head.weight.unflatten(0, (N_JOINTS, -1)).transpose(0, 1).flatten(1)
         offset = model.head.bias.unflatten(0, (N_JOINTS, -1))
         made = (model.joint_head.weight @ head).unflatten(1, (N_JOINTS, -1)).unflatten(0, (2, NOISY))
         bias = model.joint_head(offset).unflatten(1, (2, NOISY))
-        self.made = linear(made.transpose(1, 2).flatten(0, 2), bias.transpose(0, 1).flatten())
+        self.made = make_linear(made.transpose(1, 2).flatten(0, 2), bias.transpose(0, 1).flatten())
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
         """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
@@ -66,7 +67,7 @@ class BoDiffusionGraph(StemGraph):
         return self.sparse(encoded)
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
-        """Sample step by step; the last step makes the newest frame (1, 132) alone."""
+        """Sample step by step; the last step computes only the newest frame (1, 132)."""
         diffusion, limits = self.model.diffusion, self.model.compute_limits()
         last = len(diffusion.times) - 1
 
@@ -75,9 +76,9 @@ class BoDiffusionGraph(StemGraph):
             h = window + self.motion(noisy) + self.model.places
             *earlier, (block, modulation) = zip(self.blocks, self.modulations[index], strict=True)
             for one, its in earlier:
-                h = one.newest(h, its.chunk(6), self.frames)
-            made = self.made(block.newest(h, modulation.chunk(6), count))
-            made = Denoised(*made.split(ROTATION.stop, -1))
+                h = one.compute_newest(h, its.chunk(6), self.frames)
+            made = self.made(block.compute_newest(h, modulation.chunk(6), count))
+            made = DenoiserOutput(*made.split(ROTATION.stop, -1))
             mean, variance = diffusion.step(noisy[-count:], made, index, limits)
             return mean, variance.sqrt()
 
@@ -87,12 +88,12 @@ class BoDiffusionGraph(StemGraph):
 @component("model", "bodiffusion", version=2, builds="BoDiffusion")
 @dataclass
 class BoDiffusionSettings(NetworkSettings):
-    """BoDiffusion (Castillo et al. 2023): a transformer that makes a window's rotations from noise.
+    """BoDiffusion (Castillo et al. 2023): a transformer that generates a window's rotations from noise.
 
-    As published it is model.offline=true evaluation.modes=[window] export.graph=off: a clip's windows overlap
-    and are denoised together. Loss (noise, variational bound), noise schedule, features and averaged weights
-    are those of its released code; its number of sampling steps is not published. Training is this project's:
-    AdamW with its schedule, in place of 1e-5 without decay.
+    The published network needs model.offline=true evaluation.modes=[window] export.graph=off. It denoises a
+    clip's overlapping windows together. Loss (noise, variational bound), noise schedule, features and
+    averaged weights follow its released code. Its number of sampling steps is not published. The training
+    settings differ: AdamW with the profile's schedule, instead of 1e-5 without weight decay.
     """
 
     frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
@@ -125,13 +126,13 @@ class BoDiffusionSettings(NetworkSettings):
 
 
 class BoDiffusion(WindowModel):
-    """A denoiser of rotations that predicts their noise, conditioned on the window's inputs.
+    """BoDiffusion's denoiser, which predicts the noise in rotations from the window's inputs.
 
-    It has 21,942,270 trained parameters at the paper's sizes (T = 41, d = 384, 12 blocks), and position
-    embeddings of the frames that are zero and not trained, as published.
+    It has 21,942,270 trained parameters at the paper's sizes (T = 41, d = 384, 12 blocks), and frame position
+    embeddings that are zero and not trained, as in the released code.
 
-    The noise of a sample is always the same, drawn from `noise_seed`, as AGRoLDiffusion's is. A live stream
-    samples a window at each frame and keeps its last one.
+    Sampling always uses the same noise, drawn with `noise_seed`, like AGRoLDiffusion. A live stream samples a
+    window at each frame, and keeps the window's last frame.
     """
 
     graph = BoDiffusionGraph
@@ -155,34 +156,34 @@ class BoDiffusion(WindowModel):
         )  # more with more sampling steps
 
     def draw_noise(self, frames: int) -> Tensor:
-        """Draw the noise (draws, N, 132) for a sample of N frames; it is always the same."""
+        """Draw the noise (draws, N, 132) for a sample of N frames, always with `noise_seed`."""
         draw = torch.Generator().manual_seed(self.noise_seed)
-        return torch.randn(self.diffusion.draws, frames, ROTATION.stop, generator=draw)
+        return torch.randn(self.diffusion.noise_draws, frames, ROTATION.stop, generator=draw)
 
     def compute_limits(self) -> tuple[Tensor, Tensor]:
-        """Return the least and the largest values (132,) of 6D rotations, -1 and 1, in network space."""
+        """Return the limits of 6D rotations, -1 and 1, in network space: lower and upper limits (132,)."""
         mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
         return (-1 - mean) / std, (1 - mean) / std
 
-    def mix_thirds(self, encoded: Tensor) -> Tensor:
+    def mix_input_thirds(self, encoded: Tensor) -> Tensor:
         """Spread inputs (..., 54) over the joints (..., 22, 18), mixing the thirds of the input vector."""
         thirds = encoded.unflatten(-1, (len(TRACKED), CHANNELS))
         return self.spread(thirds.transpose(-1, -2)).transpose(-1, -2)
 
-    def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Denoised:
-        """Predict the noise in rotations (B, T, 132), and where each step's variance lies between its limits.
+    def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> DenoiserOutput:
+        """Predict the noise in rotations (B, T, 132), and each step's variance between its limits.
 
         Args:
             noisy: noisy rotations (B, T, 132).
             time: diffusion times (B,).
             encoded: inputs (B, T, 54) in network space.
         """
-        joints = torch.cat([noisy.unflatten(-1, (N_JOINTS, NOISY)), self.mix_thirds(encoded)], -1)
+        joints = torch.cat([noisy.unflatten(-1, (N_JOINTS, NOISY)), self.mix_input_thirds(encoded)], -1)
         h, embedding = self.stem(joints.flatten(-2)) + self.places, F.silu(self.time(time))
         for block in self.blocks:
             h = block(h, embedding)
         made = self.joint_head(self.head(h).unflatten(-1, (N_JOINTS, -1)))
-        return Denoised(*(part.flatten(-2).to(noisy) for part in made.chunk(2, -1)))
+        return DenoiserOutput(*(part.flatten(-2).to(noisy) for part in made.chunk(2, -1)))
 
     def step(self, noisy: Tensor, encoded: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Return mean and variance (B, T, 132) after a sampling step, given motion and inputs (B, T, 54)."""
@@ -199,10 +200,11 @@ class BoDiffusion(WindowModel):
         return self.diffusion.sample(step, self.noises[:, None].expand(-1, len(encoded), -1, -1))
 
     def predict_clip(self, sparse: Tensor) -> Tensor:
-        """Sample the world motion (N, 198) of a clip's world inputs (N, 54), N >= T, all windows together.
+        """Sample a clip's world motion (N, 198) from its world inputs (N, 54), N >= T, all windows together.
 
-        A window begins every T // 2 frames, and the last one ends with the clip. After every sampling step,
-        overlapping windows are averaged (Castillo et al. 2023; the released code drops the clip's tail).
+        A window begins every T // 2 frames, and the last window ends with the clip. After every sampling
+        step, overlapping windows are averaged (Castillo et al. 2023; the released code drops the clip's
+        tail).
         """
         count, size = len(sparse), self.frames
         begin = torch.tensor([*range(0, count - size, size // 2), count - size], device=sparse.device)
@@ -221,11 +223,11 @@ class BoDiffusion(WindowModel):
         return self.normalizer.posed(rotation, sparse)
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call: add noise to the truth, and denoise it in one call; see MotionModel.
+        """Add noise to the truth, and denoise it in one denoiser call; see MotionModel.
 
-        A diffusion time is drawn for each window. The returned motion is made from the rotations that remain
-        once the predicted noise is removed, clamped to their limits as in sampling; the losses are those of
-        the noise and of the variances.
+        A diffusion time is drawn for each window. The returned motion uses the noisy rotations without the
+        predicted noise, clamped to their limits like in sampling. The losses compare the noise and the
+        variances.
         """
         _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)

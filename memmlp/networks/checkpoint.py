@@ -16,7 +16,7 @@ from memmlp.common.files import atomic_write
 
 
 def write(path: Path, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
-    """Write tensors and JSON values; a kill at any moment leaves the old file or the new one."""
+    """Write tensors and JSON values; if killed, the old or the new file remains complete."""
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     atomic_write(path, save(flat, {"memmlp": json.dumps(values)}))
 
@@ -36,27 +36,27 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise InputError(f"{path}: not a checkpoint of memmlp ({error})") from error
 
 
-def module_tensors(prefix: str, module: nn.Module) -> dict[str, Tensor]:
-    """Return the parameters and buffers of a module, their names preceded by "PREFIX."."""
+def collect_module_tensors(prefix: str, module: nn.Module) -> dict[str, Tensor]:
+    """Return a module's parameters and buffers; each name begins with "PREFIX."."""
     return {f"{prefix}.{name}": tensor for name, tensor in module.state_dict().items()}
 
 
 def load_module(prefix: str, module: nn.Module, tensors: dict[str, Tensor]) -> None:
-    """Load into a module those of the tensors that `module_tensors` named with this prefix."""
+    """Load the tensors with names "PREFIX.…" into a module; see `collect_module_tensors`."""
     start = f"{prefix}."
     module.load_state_dict(
         {name.removeprefix(start): tensor for name, tensor in tensors.items() if name.startswith(start)}
     )
 
 
-def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+def collect_optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
     """Return the optimiser's state as tensors named "optimiser.PARAMETER_NUMBER.ENTRY"."""
     state = optimiser.state_dict()["state"]
     return {f"optimiser.{i}.{name}": tensor for i, entry in state.items() for name, tensor in entry.items()}
 
 
 def load_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Load the optimiser's state; its parameter groups, and so their learning rates, stay as they are."""
+    """Load the optimiser's state; its parameter groups and learning rates stay unchanged."""
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith("optimiser."):

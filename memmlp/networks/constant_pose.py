@@ -1,7 +1,7 @@
-"""One pose for every frame: the error of a network that has learned the average and nothing else.
+"""A constant pose for every frame, as a baseline: a network that has learned only the average pose.
 
-A number of a table is worth something if it is well below this one. Such floors are usual where motion is
-predicted (a zero-velocity baseline: Martinez et al., CVPR 2017); the papers of this field have none.
+A useful network has much lower errors. Such baselines are common in motion prediction, such as the
+zero-velocity baseline (Martinez et al., CVPR 2017). Papers on sparse tracking do not report one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from memmlp.networks.settings import NetworkSettings
 
 
 class ConstantPoseGraph(FrameGraph):
-    """The streaming graph of one pose, in which nothing can be quantised."""
+    """The streaming graph of a constant pose; it does not have layers to quantise."""
 
     float32_modules = ()
     model: ConstantPose
@@ -35,7 +35,7 @@ class ConstantPoseGraph(FrameGraph):
 @component("model", "constant_pose", builds="ConstantPose")
 @dataclass
 class ConstantPoseSettings(NetworkSettings):
-    """One pose that turns and moves with the head: a floor for tables, which knows only the average pose."""
+    """A baseline for tables: the average pose, which turns and moves with the head."""
 
     frames: int = setting(at_least(2), tiny=10, small=40, paper=40)  # T, the frames of a training window
 
@@ -44,10 +44,10 @@ class ConstantPoseSettings(NetworkSettings):
 
 
 class ConstantPose(WindowlessModel):
-    """A learned pose, which the coordinates alone turn and carry along: by default with the head.
+    """A learned constant pose; the coordinates turn and move it, by default with the head.
 
-    It has 132 parameters: the joints' local rotations, at first those of the normalizer's mean, or none where
-    it has no mean (`normalizer.z_scores=false`).
+    It has 132 parameters, the joints' local rotations. Their initial value is the normalizer's mean, or the
+    identity without z-scores (`normalizer.z_scores=false`).
     """
 
     graph = ConstantPoseGraph

@@ -1,4 +1,4 @@
-"""Denoising diffusion: schedules of noise, the noising of training signals, and sampling."""
+"""Denoising diffusion: noise schedules, noise for training signals, and sampling."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Denoise = Callable[[Tensor, Tensor], Tensor]
 
 
 def make_cosine_schedule(steps: int) -> Tensor:
-    """Return the cosine schedule: the signal's share (steps,) of the noisy signal's variance, float64.
+    """Return the cosine schedule: the signal's fraction (steps,) of the noisy signal's variance, float64.
 
-    This is Eq. 17 of Nichol & Dhariwal 2021, where the noise that one step adds has a share of at most 0.999.
+    This is Eq. 17 of Nichol & Dhariwal 2021. The noise of one step has a variance fraction of at most 0.999.
     """
     offset = 0.008
     time = torch.arange(steps + 1, dtype=torch.float64) / steps
@@ -27,22 +27,22 @@ def make_cosine_schedule(steps: int) -> Tensor:
 
 
 def make_linear_schedule(steps: int) -> Tensor:
-    """Return the linear schedule: the signal's share (steps,) of the noisy signal's variance, float64.
+    """Return the linear schedule: the signal's fraction (steps,) of the noisy signal's variance, float64.
 
-    The noise that one step adds has a share that grows linearly from 1e-4 to 0.02 over 1000 steps (Ho et al.
-    2020, Sec. 4); with fewer steps each one adds proportionally more, at most 0.999.
+    The variance fraction of one step's noise grows linearly from 1e-4 to 0.02 over 1000 steps (Ho et al.
+    2020, Sec. 4). With fewer steps each step adds proportionally more noise, at most 0.999.
     """
     added = torch.linspace(1e-4, 0.02, steps, dtype=torch.float64) * (1000 / steps)
     return (1 - added.clamp_max(0.999)).cumprod(0)
 
 
-class Noising(nn.Module):
-    """The noising of training signals, and the times at which a sample is denoised.
+class NoiseProcess(nn.Module):
+    """The noise process: adds noise to training signals, and defines the sampling times.
 
     Args:
-        signal: share (steps,) of signal in the noisy signal's variance, by step.
-        sampling_steps: number of denoiser calls for a sample, evenly spaced, from the noise schedule's last
-            step down (Song et al. 2021, App. D.2: linear), so that the first one sees pure noise.
+        signal: the signal's fraction (steps,) of the noisy signal's variance.
+        sampling_steps: number of denoiser calls for a sample. Their times are evenly spaced and start at the
+            schedule's last step, pure noise (Song et al. 2021, App. D.2: linear).
     """
 
     signal: Tensor
@@ -58,28 +58,28 @@ class Noising(nn.Module):
         return torch.randint(self.steps, (len(clean),), device=clean.device)
 
     def add_noise(self, clean: Tensor, time: Tensor, noise: Tensor) -> Tensor:
-        """Mix clean signals (B, ...) with standard normal noise (B, ...) as the times (B,) demand."""
-        signal = look_up(self.signal, time, clean)
+        """Mix clean signals (B, ...) with standard normal noise (B, ...), according to the times (B,)."""
+        signal = look_up_at_times(self.signal, time, clean)
         return signal.sqrt() * clean + (1 - signal).sqrt() * noise
 
     def draw_noisy(self, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw times (B,) and noise (B, ...) for a training batch (B, ...); return noisy signals, both."""
+        """Draw times (B,) and noise (B, ...) for a training batch; return noisy signals, times and noise."""
         time = distributed.draw_rows(self.draw_times, clean)
         noise = distributed.draw_rows(torch.randn_like, clean)
         return self.add_noise(clean, time, noise), time, noise
 
 
-def look_up(table: Tensor, time: Tensor, like: Tensor) -> Tensor:
-    """Return a table's values (..., B, 1, ...) at times (B,), to be broadcast to signals (B, ...)."""
+def look_up_at_times(table: Tensor, time: Tensor, like: Tensor) -> Tensor:
+    """Return a table's values at times (B,) as (..., B, 1, ...), which broadcasts to signals (B, ...)."""
     return table[..., time].unflatten(-1, (-1, *[1] * (like.dim() - 1)))
 
 
-class Diffusion(Noising):
-    """Diffusion with a cosine schedule, whose network predicts the clean signal; DDIM samples it.
+class Diffusion(NoiseProcess):
+    """Diffusion with a cosine schedule and DDIM sampling; the network predicts the clean signal.
 
     Args:
         steps: number of steps of the noise schedule.
-        sampling_steps: number of denoiser calls for a sample; see Noising.
+        sampling_steps: number of denoiser calls for a sample; see NoiseProcess.
     """
 
     def __init__(self, steps: int, sampling_steps: int):
@@ -104,7 +104,7 @@ class Diffusion(Noising):
 
         Args:
             x: the noisy signal (B, ...) at sampling step `index`.
-            clean: the estimate of the clean signal that was made from it.
+            clean: the estimated clean signal for `x`.
             index: number of the sampling step, from 0.
 
         Returns:
@@ -115,34 +115,37 @@ class Diffusion(Noising):
         return there.sqrt() * clean + (1 - there).sqrt() * direction
 
 
-Step = Callable[[Tensor, int], tuple[Tensor, Tensor]]
-"""Maps a noisy signal and the number of its sampling step to the next one's mean and deviation."""
-QUIET = 50  # from this time of the noise schedule on a sample takes the mean; BoDiffusion's code has 49
+SamplingStep = Callable[[Tensor, int], tuple[Tensor, Tensor]]
+"""Maps a noisy signal and its sampling step to mean and standard deviation of the next signal."""
+FIRST_NOISY_TIME = (
+    50  # from this time of the noise schedule on a sample takes the mean; BoDiffusion's code has 49
+)
 BIN = 2 / 255  # the width of the bins of the first step's likelihood: a pixel's, as BoDiffusion's code has it
 
 
-class Denoised(NamedTuple):
-    """What a network predicts from noisy signals (B, ...).
+class DenoiserOutput(NamedTuple):
+    """A denoiser's outputs for noisy signals (B, ...).
 
     Attributes:
         noise: the noise in the signals (B, ...).
-        share: where the logarithm of a step's variance lies (B, ...) between its limits: -1 at the least
+        variance_fraction: position (B, ...) of a step's log variance between its limits: -1 at the smallest
             variance, 1 at the largest.
     """
 
     noise: Tensor
-    share: Tensor
+    variance_fraction: Tensor
 
 
 def compute_posterior(signal: Tensor) -> Tensor:
-    """Return the coefficients of the step from a noisy signal to the one before it (Ho et al. 2020, Eq. 7).
+    """Return the coefficients of a denoising step to the previous signal (Ho et al. 2020, Eq. 7).
 
     Args:
-        signal: share (n,) of signal in the noisy signal's variance, float64.
+        signal: the signal's fraction (n,) of the noisy signal's variance, float64.
 
     Returns:
-        (4, n): the mean's coefficients of the clean and of the noisy signal, and the logarithms of the least
-        and of the largest variance. The very first step's least variance, 0, is replaced by the second's.
+        (4, n): the mean's coefficients for the clean and for the noisy signal, and the logarithms of the
+        smallest and of the largest variance. The first step's smallest variance would be 0, so it is replaced
+        by the second step's.
     """
     before = torch.cat([torch.ones_like(signal[:1]), signal[:-1]])
     added = 1 - signal / before
@@ -153,12 +156,12 @@ def compute_posterior(signal: Tensor) -> Tensor:
     return torch.stack([clean, noisy, least.log(), added.log()])
 
 
-class AncestralDiffusion(Noising):
-    """Diffusion with a linear schedule, whose network predicts noise and variances; sampled step by step.
+class AncestralDiffusion(NoiseProcess):
+    """Diffusion with a linear schedule and ancestral sampling; the network predicts noise and variances.
 
     Args:
         steps: number of steps of the noise schedule.
-        sampling_steps: number of denoiser calls for a sample; see Noising.
+        sampling_steps: number of denoiser calls for a sample; see NoiseProcess.
     """
 
     trained: Tensor
@@ -172,70 +175,75 @@ class AncestralDiffusion(Noising):
         self.register_buffer("spaced", spaced.float(), persistent=False)
 
     @property
-    def draws(self) -> int:
-        """How many draws of noise a sample takes: one for its start, one for each step that adds noise.
+    def noise_draws(self) -> int:
+        """The number of noise draws for a sample: one for its start, one for each step that adds noise.
 
-        The last step adds none, nor do those in the last 50 times of the schedule, of which a sample of few
-        steps has hardly any: the means alone would not be a sample of what the network has learned.
+        The last step and the steps within the last 50 times of the schedule do not add noise. A sample with
+        few steps has hardly any such steps. Other steps need noise to sample from the learned distribution.
         """
-        return 1 + sum(time >= QUIET for time in self.times[:-1])
+        return 1 + sum(time >= FIRST_NOISY_TIME for time in self.times[:-1])
 
     def remove_noise(self, noisy: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """Return the clean signals (B, ...) of noisy ones, given their noise (B, ...) and times (B,)."""
-        signal = look_up(self.signal, time, noisy)
+        """Return the clean signals (B, ...) of noisy signals with the given noise (B, ...) and times (B,)."""
+        signal = look_up_at_times(self.signal, time, noisy)
         return (noisy - (1 - signal).sqrt() * noise) / signal.sqrt()
 
     def compute_losses(
-        self, clean: Tensor, noise: Tensor, time: Tensor, made: Denoised, limits: tuple[Tensor, Tensor]
+        self,
+        clean: Tensor,
+        noise: Tensor,
+        time: Tensor,
+        predicted: DenoiserOutput,
+        limits: tuple[Tensor, Tensor],
     ) -> tuple[Tensor, Tensor]:
-        """Return the hybrid loss' two terms, means over components (Nichol & Dhariwal 2021, Eq. 16).
+        """Return the two terms of the hybrid loss, averaged over components (Nichol & Dhariwal 2021, Eq. 16).
 
         Args:
             clean: true signals (B, ...).
-            noise: the noise (B, ...) that was mixed into them.
-            time: the times (B,) at which the noise was mixed in.
-            made: what the network predicted from the noisy signals.
-            limits: the least and the largest value of a clean signal, to be broadcast to it.
+            noise: the noise (B, ...) in the noisy signals.
+            time: the diffusion times (B,).
+            predicted: the network's outputs for the noisy signals.
+            limits: lower and upper limit of clean signals, broadcast to their shape.
 
         Returns:
-            The mean squared error of the noise, and the variational bound in bits, whose gradient reaches the
-            variances only.
+            The mean squared error of the noise, and the variational bound in bits. The bound's gradient
+            reaches only the variances.
         """
         noisy = self.add_noise(clean, time, noise)
-        first, second, least, largest = look_up(self.trained, time, clean)
-        found = first * self.remove_noise(noisy, made.noise.detach(), time) + second * noisy
+        first, second, least, largest = look_up_at_times(self.trained, time, clean)
+        found = first * self.remove_noise(noisy, predicted.noise.detach(), time) + second * noisy
         true = first * clean + second * noisy
-        log_variance = least + (made.share + 1) / 2 * (largest - least)
+        log_variance = least + (predicted.variance_fraction + 1) / 2 * (largest - least)
         spread = log_variance - least
         divergence = (spread + (-spread).exp() + (true - found).square() * (-log_variance).exp() - 1) / 2
-        surprise = measure_surprise(clean, found, log_variance, limits)
+        surprise = compute_surprise(clean, found, log_variance, limits)
         bound = torch.where(time.view_as(first) == 0, surprise, divergence)
-        return (noise - made.noise).square().mean(), bound.mean() / math.log(2)
+        return (noise - predicted.noise).square().mean(), bound.mean() / math.log(2)
 
     def step(
-        self, noisy: Tensor, made: Denoised, index: int, limits: tuple[Tensor, Tensor]
+        self, noisy: Tensor, predicted: DenoiserOutput, index: int, limits: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return the mean and the variance (B, ...) of the signal after a sampling step.
+        """Return mean and variance (B, ...) of the signal after a sampling step.
 
         The last step's estimate is not clamped to the limits: if the network has not learned a rotation,
         clamping could make the two columns of its 6D form parallel, which is not a rotation.
 
         Args:
             noisy: the noisy signal (B, ...) at sampling step `index`.
-            made: what the network predicted from the noisy signal.
+            predicted: the network's outputs for the noisy signal.
             index: number of the sampling step, from 0.
-            limits: the least and the largest value to which the estimate of the clean signal is clamped.
+            limits: lower and upper limit for the estimated clean signal.
         """
         time = torch.full((1,), self.times[index], device=noisy.device)
         first, second, least, largest = self.spaced[:, index]
-        clean = self.remove_noise(noisy, made.noise, time)
+        clean = self.remove_noise(noisy, predicted.noise, time)
         if index + 1 < len(self.times):
             clean = clean.clamp(*limits)
         mean = first * clean + second * noisy
-        return mean, (least + (made.share + 1) / 2 * (largest - least)).exp()
+        return mean, (least + (predicted.variance_fraction + 1) / 2 * (largest - least)).exp()
 
-    def sample(self, step: Step, noise: Tensor) -> Tensor:
-        """Sample a clean signal (...) from draws of noise (`draws`, ...)."""
+    def sample(self, step: SamplingStep, noise: Tensor) -> Tensor:
+        """Sample a clean signal (...) with the given noise (`noise_draws`, ...)."""
         x, *further = noise
         for index in range(len(self.times)):
             mean, deviation = step(x, index)
@@ -243,12 +251,12 @@ class AncestralDiffusion(Noising):
         return x
 
 
-def measure_surprise(
+def compute_surprise(
     clean: Tensor, mean: Tensor, log_variance: Tensor, limits: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """Return how surprising clean signals (B, ...) are to a Gaussian, in nats, by bins of 2/255 (Ho et al.).
+    """Return the negative log likelihood of clean signals (B, ...) under a Gaussian, in nats (Ho et al.).
 
-    The two outermost bins, at the limits, reach to minus and plus infinity.
+    Signals are discretised in bins of 2/255. The outermost bins extend to infinity.
     """
     scale, (low, high) = (-log_variance / 2).exp(), limits
     below, above = (torch.special.ndtr((clean + edge - mean) * scale) for edge in (-BIN / 2, BIN / 2))
@@ -258,11 +266,11 @@ def measure_surprise(
 
 
 class TimeEmbedding(nn.Module):
-    """Sines and cosines of the diffusion time, then Linear, SiLU, Linear (Ho et al. 2020).
+    """An embedding of the diffusion time: sines and cosines, then Linear, SiLU, Linear (Ho et al. 2020).
 
     Args:
         width: d, the width of the embedding.
-        sines: how many sines and cosines there are; by default d.
+        sines: total number of sines and cosines; by default d.
     """
 
     PERIOD = 10_000

@@ -1,7 +1,7 @@
-"""HMD-Poser (Dai et al., CVPR 2024): recurrent layers over time, a transformer over the trackers of a frame.
+"""HMD-Poser (Dai et al., CVPR 2024): recurrent layers over time, and a transformer over a frame's trackers.
 
-It is the published network with three trackers, whose inputs for further sensors on legs and pelvis are zero.
-All bodies here have the mean shape, so the predicted shape does not enter the joints' positions.
+This is the published network for three trackers. Its inputs for sensors on legs and pelvis are zero. All
+bodies here have the mean shape, so the predicted shape does not affect joint positions.
 """
 
 from __future__ import annotations
@@ -40,20 +40,18 @@ SHAPE = 16  # components of a body's shape
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
 
 
-def split_by_tracker(sparse: Tensor) -> list[Tensor]:
-    """Split inputs (..., 54) by tracker: rotations (..., 3, 6), angular velocities (..., 3, 6), positions
-    (..., 3, 3) and velocities (..., 3, 3).
-    """
+def split_by_feature(sparse: Tensor) -> list[Tensor]:
+    """Split inputs (..., 54) by feature, each (..., 3 trackers, n)."""
     parts = SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY
     return [sparse[..., part].unflatten(-1, (len(TRACKED), -1)) for part in parts]
 
 
-def move_to_head(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+def convert_hands_to_head_frame(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
     """Return the hands' rotations (..., 2, 3, 3) and positions (..., 2, 3) in the head's frame.
 
     Args:
         rotation: rotations of head and hands (..., 3, 3, 3).
-        position: their positions (..., 3, 3).
+        position: positions of head and hands (..., 3, 3).
     """
     back = rotation[..., :1, :, :].transpose(-1, -2)
     away = position[..., 1:, :] - position[..., :1, :]
@@ -61,27 +59,27 @@ def move_to_head(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def locate_hands(sparse: Tensor) -> list[Tensor]:
-    """Return `split_by_tracker` of both hands in the head's frame, from world inputs (..., 54).
+    """Return both hands' features in the head's frame, for world inputs (..., 54); see `split_by_feature`.
 
-    The previous frame is reconstructed from the velocities in the inputs. All is computed in float32 in a
-    mixed-precision training, too: velocities are small differences.
+    The previous frame is reconstructed from the velocities in the inputs. The computation is always in
+    float32, because velocities are small differences.
     """
-    rotation, turn, position, velocity = split_by_tracker(sparse)
+    rotation, turn, position, velocity = split_by_feature(sparse)
     with in_float32(sparse.device):
         now = sixd_to_matrix(rotation)
         before = now @ sixd_to_matrix(turn).transpose(-1, -2)
-        rotations, positions = move_to_head(now, position)
-        earlier, places = move_to_head(before, position - velocity)
+        rotations, positions = convert_hands_to_head_frame(now, position)
+        earlier, places = convert_hands_to_head_frame(before, position - velocity)
         turned = earlier.transpose(-1, -2) @ rotations
     return [matrix_to_sixd(rotations), matrix_to_sixd(turned), positions, positions - places]
 
 
 class TokenEmbedding(nn.Module):
-    """A token made of several parts side by side, each through a linear layer and LeakyReLU.
+    """A token of concatenated parts, each from a linear layer and LeakyReLU.
 
     Args:
         inputs: number of features of each part.
-        outputs: number of the token's features that each part makes.
+        outputs: number of token features from each part.
     """
 
     def __init__(self, inputs: Sequence[int], outputs: Sequence[int]):
@@ -95,7 +93,7 @@ class TokenEmbedding(nn.Module):
 
 
 class NormedLSTM(nn.Module):
-    """An LSTM whose weights are directions times a learned gain for each row (Salimans & Kingma 2016).
+    """An LSTM with normalised weights: a direction and a learned gain for each row (Salimans & Kingma 2016).
 
     Args:
         width: d, the width of inputs and outputs.
@@ -111,7 +109,7 @@ class NormedLSTM(nn.Module):
         self.biases = nn.ParameterList([plain.bias_ih_l0, plain.bias_hh_l0])
 
     def forward(self, x: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Run over inputs (B, n, d) from states (B, d); return outputs (B, n, d) and the states after."""
+        """Run over inputs (B, n, d) from states (B, d); return outputs (B, n, d) and new states."""
         pairs = zip(self.directions, self.gains, strict=True)
         weights = [F.normalize(direction, dim=1) * gain for direction, gain in pairs]
         states = [state.contiguous()[None] for state in (hidden, cell)]
@@ -136,7 +134,7 @@ class TimeAndTokenBlock(nn.Module):
         self.layers = make_encoder(settings, settings.encoder_layers)
 
     def forward(self, tokens: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Map tokens (B, n, 8, d) and states (B, 8, d) to tokens and the states after the last frame."""
+        """Map tokens (B, n, 8, d) and states (B, 8, d) to new tokens, and to states after the last frame."""
         each = [part.unbind(axis) for part, axis in ((tokens, 2), (hidden, 1), (cell, 1))]
         made = [lstm(*of) for lstm, *of in zip(self.over_time, *each, strict=True)]
         outputs, hidden, cell = (
@@ -164,9 +162,9 @@ class HMDPoserGraph(FrameGraph):
 class HMDPoserSettings(NetworkSettings):
     """HMD-Poser (Dai et al. 2024) with three trackers: LSTMs, and a transformer over a frame's tokens.
 
-    It is a stream without a window. Loss and features are those of its released code, on the mean body.
-    Training is this project's: AdamW with its schedule, in place of Adam at 1e-3 with a warm-up and a fall
-    after 300 of 400 epochs.
+    It is a stream without a window. Loss and features follow its released code, on the mean body. The
+    training settings differ: AdamW with the profile's schedule, instead of Adam at 1e-3 with a warm-up and a
+    drop after 300 of 400 epochs.
     """
 
     # T, the frames of a training window, from zero states; live there is no window
@@ -186,11 +184,11 @@ class HMDPoserSettings(NetworkSettings):
 
 
 class HMDPoser(WindowlessModel):
-    """Tokens of trackers, blocks of LSTMs and encoder layers, and a head on all tokens of a frame.
+    """HMD-Poser: tracker tokens, blocks of LSTMs and encoder layers, and a head on all tokens of a frame.
 
-    It has 17,444,484 parameters at the paper's sizes, of which 528,656 belong to the head for the body's
-    shape, and carries two states of d for each LSTM: 8,192 numbers. Evaluation runs over whole clips,
-    training over windows of T frames, both from zero states.
+    It has 17,444,484 parameters at the paper's sizes, including 528,656 for the shape head. It carries two
+    states of d numbers for each LSTM, in total 8,192 numbers. Evaluation runs over whole clips, training over
+    windows of T frames, both from zero states.
     """
 
     graph = HMDPoserGraph
@@ -207,16 +205,16 @@ class HMDPoser(WindowlessModel):
         self.others = nn.ModuleList(TokenEmbedding(*unseen) for _ in range(OTHERS))
         self.norm = nn.LayerNorm(settings.width, eps=1e-6)
         self.blocks = nn.ModuleList(TimeAndTokenBlock(settings) for _ in range(settings.depth))
-        self.pose = self._head(ROTATION.stop)
-        self.shape = self._head(SHAPE) if settings.shape_weight else None
+        self.pose = self._make_head(ROTATION.stop)
+        self.shape = self._make_head(SHAPE) if settings.shape_weight else None
 
-    def _head(self, size: int) -> nn.Module:
+    def _make_head(self, size: int) -> nn.Module:
         return nn.Sequential(
             nn.Linear(TOKENS * self.width, self.width), nn.LeakyReLU(), nn.Linear(self.width, size)
         )
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start: zeros (B, 8 x depth, d)."""
+        """Return the initial state: zeros (B, 8 x depth, d)."""
         state = torch.zeros(batch, TOKENS * self.depth, self.width).to(self.normalizer.mean)
         return {"hidden": state, "cell": state.clone()}
 
@@ -226,7 +224,7 @@ class HMDPoser(WindowlessModel):
         nothing = [encoded.new_zeros(*encoded.shape[:-1], OTHERS, size) for size in (6, 6, 3)]
         found = []
         for layers, parts in (
-            (self.trackers, split_by_tracker(encoded)),
+            (self.trackers, split_by_feature(encoded)),
             (self.hands, locate_hands(sparse)),
             (self.others, nothing),
         ):
@@ -235,7 +233,7 @@ class HMDPoser(WindowlessModel):
         return self.norm(torch.stack(found, -2))
 
     def compute_features(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
-        """Map world inputs (B, n, 54) and the state to features (B, n, 8 d) and the state after them."""
+        """Map world inputs (B, n, 54) and the state to features (B, n, 8 d) and the new state."""
         tokens = self.make_tokens(sparse)
         states = (state[name].split(TOKENS, 1) for name in ("hidden", "cell"))
         carried = []
@@ -251,7 +249,7 @@ class HMDPoser(WindowlessModel):
         return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call, which adds the loss of the predicted shape; see MotionModel."""
+        """Predict the motion, and add the loss of the predicted shape; see MotionModel."""
         features, kept = self.compute_features(sparse, state)
         losses = {}
         if self.shape is not None:  # how much the predicted shapes vary within a window

@@ -1,4 +1,4 @@
-"""The MLP block of Mem-MLP and AGRoL, and layers that several networks share."""
+"""The MLP block of Mem-MLP and AGRoL, and layers for several networks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from memmlp.common import distributed
 class TimeMix(nn.Module):
     """Mixes the frames of a window by a T x T matrix, the same for every channel (Conv1d T -> T, kernel 1).
 
-    It is written as one matrix product from the left, which needs no transposes.
+    It is one matrix product from the left, without transposes.
     """
 
     def __init__(self, frames: int):
@@ -30,10 +30,10 @@ class TimeMix(nn.Module):
 
         Args:
             h: (B, T, d) or (T, d).
-            newest: how many of the newest frames to return; 0 for all of them.
+            newest: number of newest frames to return; 0 for all frames.
 
         Returns:
-            (B, n, d) or (n, d), where n is `newest`, or T if that is 0.
+            (B, n, d) or (n, d); n is `newest`, or T for all frames.
         """
         weight, bias = self.weight[-newest:], self.bias[-newest:]
         if h.dim() == 2:
@@ -42,12 +42,12 @@ class TimeMix(nn.Module):
 
 
 class MLPBlock(nn.Module):
-    """AGRoL's pre-norm pair (Sec. 3.2.1, reading 1): mix over time, then over channels, both residual.
+    """AGRoL's pre-norm MLP block: mix over time, then over channels, both residual (Sec. 3.2.1).
 
     Args:
         hidden: d, the width of the hidden state.
         frames: T, the window's length.
-        extra: width of further inputs of the linear layer.
+        extra: width of additional inputs to the linear layer. See docs/readings.md, no. 1.
     """
 
     def __init__(self, hidden: int, frames: int, extra: int = 0):
@@ -59,18 +59,18 @@ class MLPBlock(nn.Module):
 
     def forward(self, h: Tensor, past: object = None) -> Tensor:
         """Map the hidden state (B, T, d) to (B, T, d); `past` is ignored."""
-        return self.newest(h, h.shape[-2])
+        return self.compute_newest(h, h.shape[-2])
 
-    def newest(self, h: Tensor, count: int) -> Tensor:
-        """Map (B, T, d) to the newest `count` frames (B, count, d), without computing the others."""
+    def compute_newest(self, h: Tensor, count: int) -> Tensor:
+        """Map (B, T, d) to the newest `count` frames (B, count, d), without computing older frames."""
         h = h[..., -count:, :] + F.silu(self.time_mix(self.time_norm(h), count))
         return h + F.silu(self.linear(self.norm(h)))
 
 
 class ResidualFusion(MLPBlock):
-    """An MLP block whose linear layer also sees the memory feature: h + f([h; z]) (reading 3).
+    """An MLP block whose linear layer also sees the memory feature: h + f([h; z]).
 
-    Its argument `extra` is k, the width of the memory feature.
+    Its argument `extra` is k, the width of the memory feature. See docs/readings.md, no. 3.
     """
 
     def fuse(self, h: Tensor, z: Tensor) -> Tensor:
@@ -80,7 +80,7 @@ class ResidualFusion(MLPBlock):
 
 
 class PlainFusion(MLPBlock):
-    """An MLP block followed by Linear([h; z]) from d + k to d without a residual: the literal concatenation.
+    """An MLP block followed by Linear([h; z]) from d + k to d, without a residual.
 
     Args:
         hidden: d.
@@ -98,17 +98,17 @@ class PlainFusion(MLPBlock):
 
 
 class Dropout(nn.Dropout):
-    """Dropout that draws the same values for a row of a batch, however many processes share the batch."""
+    """Dropout whose values for a row do not depend on the number of processes that share a batch."""
 
     def forward(self, h: Tensor) -> Tensor:
-        """Set random elements of features (B, ...) to 0 in training, and scale the others up."""
+        """In training, set random elements of features (B, ...) to 0, and scale the remaining elements up."""
         if not (self.training and distributed.is_batch_split()):
             return super().forward(h)
         return h * distributed.draw_rows(lambda like: F.dropout(torch.ones_like(like), self.p), h)
 
 
-def find_batch_dependent(module: nn.Module) -> list[str]:
-    """Name the layers whose result for a row depends on the other rows of the batch."""
+def find_batch_dependent_layers(module: nn.Module) -> list[str]:
+    """Return the class names of layers whose result for a row depends on other rows of the batch."""
 
     def draws(layer: nn.Module) -> bool:
         if isinstance(layer, nn.RNNBase):
@@ -118,13 +118,13 @@ def find_batch_dependent(module: nn.Module) -> list[str]:
     found = (
         layer
         for layer in module.modules()
-        if isinstance(layer, _BatchNorm) or getattr(layer, "of_whole_batch", False) or draws(layer)
+        if isinstance(layer, _BatchNorm) or getattr(layer, "needs_whole_batch", False) or draws(layer)
     )
     return sorted({type(layer).__name__ for layer in found})
 
 
-def compute_products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the contributions of an input (B, n) and of the hidden state (B, d) to a layer's gates.
+def compute_gate_products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what an input (B, n) and the hidden state (B, d) each add to a layer's gates.
 
     Args:
         weights: the layer's weights and biases, in the order of `nn.RNNBase.all_weights`.
@@ -136,8 +136,8 @@ def compute_products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tu
 
 
 def step_gru(weights: Sequence[Tensor], x: Tensor, state: Tensor) -> Tensor:
-    """Return a GRU layer's state (B, d) after an input (B, n) at a state (B, d), in plain layers."""
-    entering, again = (part.chunk(3, -1) for part in compute_products(weights, x, state))
+    """Return a GRU layer's new state (B, d) for an input (B, n) and a state (B, d), with plain layers."""
+    entering, again = (part.chunk(3, -1) for part in compute_gate_products(weights, x, state))
     reset, keep = (torch.sigmoid(entering[gate] + again[gate]) for gate in range(2))
     new = torch.tanh(entering[2] + reset * again[2])
     return new + keep * (state - new)

@@ -1,10 +1,10 @@
-"""Arms and legs in closed form, as MANIKIN has them (Jiang et al., ECCV 2024).
+"""Closed-form solutions for arms and legs, from MANIKIN (Jiang et al., ECCV 2024).
 
-A limb has a base (shoulder, hip), a middle (elbow, knee) and an end (wrist, ankle). Given its base and end,
-the middle can be anywhere on a circle; the **swivel** is the angle on that circle. Elbows and knees bend
-about one axis each.
+A limb has a base (shoulder, hip), a middle (elbow, knee) and an end (wrist, ankle). For a given base and end,
+the middle lies on a circle; the **swivel** is its angle on that circle. Each elbow and knee bends about one
+axis.
 
-Vectors and rotations of the four limbs stand side by side: left arm, right arm, left leg, right leg.
+The order of the four limbs in tensors is left arm, right arm, left leg, right leg.
 """
 
 from __future__ import annotations
@@ -22,13 +22,15 @@ from memmlp.motion.geometry import matrix_to_wxyz
 BASES, MIDDLES, ENDS = (16, 17, 1, 2), (18, 19, 4, 5), (20, 21, 7, 8)
 ANKLES, TOES = ENDS[2:], (10, 11)
 FLEXION = ((0.189, -0.966, 0.179), (0.085, 0.970, -0.227), (0.985, 0.003, -0.174), (0.995, -0.029, 0.096))
-"""The axes, in the rest pose, about which elbows and knees bend, as published for SMPL's bodies."""
-TWIST = (90.0, 90.0, 40.0, 40.0)
-"""How far, in degrees, shoulders and hips may be twisted about their upper bone, to either side."""
+"""The rotation axes of elbows and knees in the rest pose, as published for SMPL bodies."""
+MAX_TWIST = (90.0, 90.0, 40.0, 40.0)
+"""The maximum twist of shoulders and hips about their upper bone, in degrees, in both directions."""
 SKEW = ((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0))
-"""What each component of a vector adds to the 3 x 3 matrix of its cross product, row by row."""
+"""The contribution of each vector component to the 3 x 3 cross-product matrix, row by row."""
 IDENTITY = ((1.0, 0, 0), (0, 1, 0), (0, 0, 1))
-STRAIGHT = 5e-4  # from 1, of the cosine of the least bend, 1.8 degrees: on a straighter limb rounding is seen
+STRAIGHT_MARGIN = (
+    5e-4  # from 1, of the cosine of the least bend, 1.8 degrees: on a straighter limb rounding is seen
+)
 OFFSET = 1e-3  # metres; which way a limb bends that is straighter than that follows from its axis of flexion
 
 
@@ -38,18 +40,18 @@ def dot(one: Tensor, other: Tensor) -> Tensor:
 
 
 def select_joints(joints: Tensor, which: Sequence[int], axis: int = -2) -> Tensor:
-    """Return the entries of a tensor for some joints, which are indexed along the given axis."""
+    """Return a tensor's entries for the joints `which` along an axis."""
     return joints.index_select(axis, torch.tensor(which, device=joints.device))
 
 
-def skew(vector: Tensor) -> Tensor:
-    """Return the matrices (..., 3, 3) that take the cross product of vectors (..., 3) with another."""
+def make_cross_matrices(vector: Tensor) -> Tensor:
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     return (vector @ vector.new_tensor(SKEW)).unflatten(-1, (3, 3))
 
 
 def cross(one: Tensor, other: Tensor) -> Tensor:
     """Return the cross products (..., 3) of vectors (..., 3)."""
-    return rotate(skew(one), other)
+    return rotate(make_cross_matrices(one), other)
 
 
 def rotate(rotation: Tensor, vector: Tensor) -> Tensor:
@@ -57,25 +59,25 @@ def rotate(rotation: Tensor, vector: Tensor) -> Tensor:
     return (rotation @ vector[..., None])[..., 0]
 
 
-def rotate_about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+def make_axis_rotations(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) about unit axes (..., 3), given the cosine and sine (..., 1)."""
-    across, identity = skew(axis), axis.new_tensor(IDENTITY)
+    across, identity = make_cross_matrices(axis), axis.new_tensor(IDENTITY)
     return identity + sine[..., None] * across + (1 - cosine)[..., None] * (across @ across)
 
 
-def align(start: Tensor, goal: Tensor) -> Tensor:
-    """Return the smallest rotations (..., 3, 3) that turn unit vectors (..., 3) onto others."""
-    across, identity = skew(cross(start, goal)), goal.new_tensor(IDENTITY)
+def find_aligning_rotations(start: Tensor, goal: Tensor) -> Tensor:
+    """Return the smallest rotations (..., 3, 3) from unit vectors `start` to unit vectors `goal` (..., 3)."""
+    across, identity = make_cross_matrices(cross(start, goal)), goal.new_tensor(IDENTITY)
     return identity + across + across @ across / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
 
 
 def build_frame(first: Tensor, second: Tensor) -> Tensor:
-    """Return the rotations (..., 3, 3) whose columns are two perpendicular unit vectors and their product."""
+    """Return rotations (..., 3, 3) with two perpendicular unit vectors and their cross product as columns."""
     return torch.stack([first, second, cross(first, second)], -1)
 
 
-def find_circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the directions (..., 3) that belong to swivels of 0 and of 90 degrees.
+def find_swivel_directions(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the directions (..., 3) for swivels of 0 and of 90 degrees.
 
     Args:
         axis: unit vectors (..., 3) from base to end.
@@ -86,26 +88,26 @@ def find_circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def measure_swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
-    """Return the cosines and sines (..., 2) of swivels, from limbs' joints (..., 3) and the bases' Y axes."""
+    """Return swivels (..., 2), cosine and sine, for limb joints (..., 3) and the bases' Y axes `up`."""
     axis = F.normalize(end - base, dim=-1)
-    start, quarter = find_circle(axis, up)
+    start, quarter = find_swivel_directions(axis, up)
     away = middle - base
     return F.normalize(torch.cat([dot(away, start), dot(away, quarter)], -1), dim=-1)
 
 
 def find_bend_direction(axis: Tensor, up: Tensor, swivel: Tensor) -> Tensor:
-    """Return the unit vectors (..., 3) from the axis to the middle, for swivels (..., 2), cosine and sine."""
-    start, quarter = find_circle(axis, up)
+    """Return unit vectors (..., 3) from the axis to the middle, for swivels (..., 2), cosine and sine."""
+    start, quarter = find_swivel_directions(axis, up)
     return swivel[..., :1] * start + swivel[..., 1:] * quarter
 
 
 def place_middle(
     base: Tensor, end: Tensor, up: Tensor, swivel: Tensor, upper: Tensor, lower: Tensor
 ) -> Tensor:
-    """Return the middle joints (..., 3) of limbs, metres.
+    """Return the positions of the limbs' middle joints (..., 3), metres.
 
     Args:
-        base, end: the limbs' other joints (..., 3), metres.
+        base, end: positions of the limbs' bases and ends (..., 3), metres.
         up: the bases' Y axes (..., 3).
         swivel: cosines and sines (..., 2) of the swivels.
         upper, lower: lengths of the bones (..., 1), metres.
@@ -125,31 +127,31 @@ def find_bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def bend_middles(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
-    """Return the rotations (..., 4, 3, 3) of elbows and knees that bring hands and feet to a given reach.
+    """Return the rotations (..., 4, 3, 3) of elbows and knees for given distances from base to end.
 
-    Of the two ways to bend, each limb takes the one about its own axis of flexion. If the reach is out of a
-    limb's range, the limb is as straight, or as bent, as possible.
+    Each limb bends in the direction of its flexion axis. If a distance is out of range, the limb is as
+    straight or as bent as possible.
 
     Args:
-        upper, lower, axis: see `bones`.
-        reach: the distances (..., 4, 1), metres.
+        upper, lower, axis: see `find_bones`.
+        reach: the distances from base to end (..., 4, 1), metres.
     """
     along = dot(upper, axis) * dot(lower, axis)
     cosine, sine = dot(upper, lower) - along, dot(upper, cross(axis, lower))
     size = (cosine.square() + sine.square()).sqrt()
     wanted = (reach.square() - dot(upper, upper) - dot(lower, lower)) / 2 - along
-    bend = (wanted / size).clamp(-1 + STRAIGHT, 1 - STRAIGHT)
+    bend = (wanted / size).clamp(-1 + STRAIGHT_MARGIN, 1 - STRAIGHT_MARGIN)
     across, cosine, sine = ((1 - bend) * (1 + bend)).sqrt(), cosine / size, sine / size
     axes = axis.expand(*bend.shape[:-1], 3)
-    return rotate_about(axes, cosine * bend - sine * across, sine * bend + cosine * across)
+    return make_axis_rotations(axes, cosine * bend - sine * across, sine * bend + cosine * across)
 
 
 def measure_twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cosines and sines (..., 1) of the angles by which rotations (..., 3, 3) turn about an axis.
+    """Return cosine and sine (..., 1) of the twist of rotations (..., 3, 3) about an axis.
 
     Args:
         rotation: rotations (..., 3, 3).
-        axis: the axes, unit vectors (..., 3).
+        axis: unit vectors (..., 3).
     """
     flat = rotation.flatten(-2)
     turned, trace = flat @ flat.new_tensor(SKEW).T, flat @ flat.new_tensor(IDENTITY).flatten()[:, None]
@@ -159,12 +161,10 @@ def measure_twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def limit_twist(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
-    """Return rotations (..., 4, 3, 3) about the limbs' axes that bring the bases' twists within limits.
+    """Return the smallest rotations (..., 4, 3, 3) about the limbs' axes that limit the bases' twists.
 
-    Each is the smallest that does.
-
-    If h is half of such a rotation's angle, the twist of the rotated base is a ratio of sums of sin h and cos
-    h, from which tan h follows. A base within its limits is not rotated.
+    A base within its limits is not rotated. Otherwise let h be half of the rotation's angle: the rotated
+    base's twist is a ratio of sums of sin h and cos h, which gives tan h.
 
     Args:
         local: the bases' local rotations (..., 4, 3, 3).
@@ -172,7 +172,7 @@ def limit_twist(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
         axis: the unit vectors (..., 4, 3) from base to end, in the frames of the bases' parents.
     """
     real, vector = matrix_to_wxyz(local).split([1, 3], -1)
-    limit = (local.new_tensor(TWIST) * (math.pi / 360)).tan()[:, None]
+    limit = (local.new_tensor(MAX_TWIST) * (math.pi / 360)).tan()[:, None]
     turned = dot(vector, bone)
     by_sine = real * dot(axis, bone) + dot(cross(axis, vector), bone)
     found = []
@@ -182,7 +182,7 @@ def limit_twist(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
     nearest = torch.where(found[0].abs() < found[1].abs(), found[0], found[1])
     half = torch.where(turned.abs() > limit * real, nearest, 0.0)
     size = 1 + half.square()
-    return rotate_about(axis, 2 / size - 1, 2 * half / size)
+    return make_axis_rotations(axis, 2 / size - 1, 2 * half / size)
 
 
 def solve_limbs(
@@ -197,11 +197,12 @@ def solve_limbs(
 ) -> Tensor:
     """Return the local rotations (..., 22, 3, 3) of a body with its limbs solved.
 
-    Wrists and ankles get to their given positions as far as the limbs reach. The part of a hand's rotation
-    about its forearm goes to the elbow, the rest to the wrist; a foot takes the smallest rotation to its toe.
+    Wrists and ankles are placed at their given positions within the limbs' reach. A hand's rotation about its
+    forearm goes to the elbow, its remaining rotation to the wrist. A foot takes the smallest rotation to its
+    toe.
 
     Args:
-        local: local rotations (..., 22, 3, 3), of which those of the limbs are ignored.
+        local: local rotations (..., 22, 3, 3); the limbs' rotations are ignored.
         turned: global rotations (..., 22, 3, 3) of the same body.
         base: positions (..., 4, 3) of shoulders and hips, metres.
         end: positions (..., 4, 3) of wrists and ankles.
@@ -225,11 +226,11 @@ def solve_limbs(
     arms, shins = (back.transpose(-1, -2) @ bases @ bent).split(2, -3)
     seen = arms.transpose(-1, -2) @ hands
     forearm = F.normalize(lower[:2], dim=-1).expand(*seen.shape[:-2], 3)
-    rolled = rotate_about(forearm, *measure_twist(seen, forearm))
+    rolled = make_axis_rotations(forearm, *measure_twist(seen, forearm))
     wrists = rolled.transpose(-1, -2) @ seen
     goal = rotate(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
     foot = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1).expand(goal.shape)
-    ankles = align(foot, goal)
+    ankles = find_aligning_rotations(foot, goal)
     middles = torch.cat([bent[..., :2, :, :] @ rolled, bent[..., 2:, :, :]], -3)
     rows = list(local.unbind(-3))
     groups = ((BASES, bases), (MIDDLES, middles), (ENDS, torch.cat([wrists, ankles], -3)))
@@ -240,14 +241,16 @@ def solve_limbs(
 
 
 SHOULDERS, ELBOWS, WRISTS = (slice(left, right + 1) for left, right, *_ in (BASES, MIDDLES, ENDS))
-"""The joints of both arms, which are the body's last ones, and follow each other."""
-BEGINNING, ENDING = slice(SHOULDERS.start, ELBOWS.stop), slice(ELBOWS.start, WRISTS.stop)
-"""Where the arms' bones begin and end: the upper ones, then the lower ones."""
-SLACK = 1e-3  # the part of its reach by which an arm is never quite straight, nor folded: so it has a side
+"""The joints of both arms, which are the body's last joints, as slices."""
+BONE_STARTS, BONE_ENDS = slice(SHOULDERS.start, ELBOWS.stop), slice(ELBOWS.start, WRISTS.stop)
+"""The joints where the arms' bones begin and end: upper bones, then lower bones."""
+REACH_MARGIN = (
+    1e-3  # the part of its reach by which an arm is never quite straight, nor folded: so it has a side
+)
 
 
 def use_tracker_rotations(rotations: Tensor, sparse: Tensor) -> Tensor:
-    """Replace the rotations of head and wrists by those of their trackers.
+    """Replace the rotations of head and wrists by their trackers' rotations.
 
     Args:
         rotations: global rotations (..., 132), 6D, world.
@@ -260,11 +263,13 @@ def use_tracker_rotations(rotations: Tensor, sparse: Tensor) -> Tensor:
     )
 
 
-def reach_hands(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Bend the arms of a body so that its wrists get to their trackers, as far as the arms reach.
+def bend_arms_to_trackers(
+    rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Bend a body's arms so that its wrists meet their trackers, within the arms' reach.
 
-    Each elbow stays on its side of the line from shoulder to hand; the elbow of a straight arm goes to the
-    back of the upper arm. The bones are turned by the smallest rotations.
+    Each elbow stays on its side of the line from shoulder to hand. The elbow of a straight arm moves towards
+    the back of the upper arm. The bones take the smallest possible rotations.
 
     Args:
         rotations: global rotations (..., 22, 3, 3), world.
@@ -276,30 +281,32 @@ def reach_hands(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor)
         Rotations and positions of the body with its arms bent.
     """
     hands = sparse[..., SPARSE_POSITION].unflatten(-1, (3, 3))[..., 1:, :]
-    shoulder, arms = joints[..., SHOULDERS, :], rotations[..., BEGINNING, :, :]
-    bones = joints[..., ENDING, :] - joints[..., BEGINNING, :]
-    lengths = (rest[ENDING] - rest[BEGINNING]).norm(dim=-1, keepdim=True)
+    shoulder, arms = joints[..., SHOULDERS, :], rotations[..., BONE_STARTS, :, :]
+    bones = joints[..., BONE_ENDS, :] - joints[..., BONE_STARTS, :]
+    lengths = (rest[BONE_ENDS] - rest[BONE_STARTS]).norm(dim=-1, keepdim=True)
     side = bones[..., :2, :] - OFFSET * arms[..., :2, :, 2]  # the upper arms' third axes point to the front
-    elbow, wrist = bend_arms(hands - shoulder, side, *lengths.split(2))
+    elbow, wrist = place_elbows_and_wrists(hands - shoulder, side, *lengths.split(2))
     bent = torch.cat([elbow, wrist - elbow], -2)
-    arms = align(bones / lengths, bent / lengths) @ arms
-    turned = [rotations[..., : BEGINNING.start, :, :], arms, rotations[..., BEGINNING.stop :, :, :]]
-    placed = [joints[..., : ENDING.start, :], shoulder + elbow, shoulder + wrist]
+    arms = find_aligning_rotations(bones / lengths, bent / lengths) @ arms
+    turned = [rotations[..., : BONE_STARTS.start, :, :], arms, rotations[..., BONE_STARTS.stop :, :, :]]
+    placed = [joints[..., : BONE_ENDS.start, :], shoulder + elbow, shoulder + wrist]
     return torch.cat(turned, -3), torch.cat(placed, -2)
 
 
-def bend_arms(goal: Tensor, side: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the positions of elbows and wrists of arms that reach to a goal, all relative to the shoulders.
+def place_elbows_and_wrists(
+    goal: Tensor, side: Tensor, upper: Tensor, lower: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the positions of elbows and wrists relative to the shoulders, for arms that reach for a goal.
 
     Args:
-        goal: where the wrists should be (..., 2, 3), metres.
-        side: to which side of the goal the elbows are (..., 2, 3).
+        goal: target positions of the wrists (..., 2, 3), metres.
+        side: directions from the goal's axis towards the elbows (..., 2, 3).
         upper: lengths of the upper bones (2, 1).
-        lower: lengths of the lower ones (2, 1).
+        lower: lengths of the lower bones (2, 1).
     """
     distance = goal.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     axis = goal / distance
-    most, least = (upper + lower) * (1 - SLACK), (upper - lower).abs() + upper * SLACK
+    most, least = (upper + lower) * (1 - REACH_MARGIN), (upper - lower).abs() + upper * REACH_MARGIN
     reach = distance.minimum(most).maximum(least)
     cosine = reach / (2 * upper) + (upper.square() - lower.square()) / (2 * upper) / reach
     sine = (1 - cosine.square()).clamp_min(1e-9).sqrt()

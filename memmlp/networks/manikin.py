@@ -1,9 +1,9 @@
-"""MANIKIN (Jiang et al., ECCV 2024): networks predict the trunk and where limbs end; the limbs are solved.
+"""MANIKIN (Jiang et al., ECCV 2024): networks predict trunk and limb ends, and the limbs are solved.
 
-MANIKIN-S has AvatarPoser's encoder, MANIKIN-L AvatarJLM's network. What they predict of a frame
-(`PredictedParts`) is turned into a pose in closed form (memmlp.networks.limb_solver). Readings: all
-heights are the world's, since a stream does not know the lowest foot of its clip; the head has its tracker's
-rotation; and a straight limb does not keep the swivel of the frame before.
+MANIKIN-S uses AvatarPoser's encoder, MANIKIN-L uses AvatarJLM's network. A closed-form solver makes a pose
+from their predictions for a frame (`PredictedParts`; memmlp.networks.limb_solver). Our readings: heights are
+world heights, because a stream does not know its clip's lowest foot. The head has its tracker's rotation. A
+straight limb does not keep the swivel of the previous frame.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_m
 from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.normalizer import Normalizer, in_float32
 from memmlp.networks.avatar_jlm import AvatarJLM, AvatarJLMGraph, AvatarJLMSettings
-from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserGraph, AvatarPoserSettings, head
+from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserGraph, AvatarPoserSettings, make_head
 from memmlp.networks.limb_solver import (
     ANKLES,
     BASES,
@@ -51,27 +51,27 @@ from memmlp.networks.limb_solver import (
 from memmlp.networks.motion_model import MotionModel, State, TrainingOutputs
 from memmlp.networks.transformer import draw_weights
 
-KEPT = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
-"""The joints whose local rotations are predicted, besides the root's: the trunk's, shoulders and hips."""
+PREDICTED_JOINTS = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
+"""The joints with predicted local rotations besides the root: trunk, shoulders and hips."""
 SWIVELS, PLACES = 2 * len(BASES), 3 * (len(ANKLES) + len(TOES))
-PREDICTED = 6 * (1 + len(KEPT)) + SWIVELS + PLACES
-AUXILIARY = 6 * (N_JOINTS - 1)  # rotations that MANIKIN-L predicts in training alone
+PREDICTED_SIZE = 6 * (1 + len(PREDICTED_JOINTS)) + SWIVELS + PLACES
+AUXILIARY_SIZE = 6 * (N_JOINTS - 1)  # rotations that MANIKIN-L predicts in training alone
 
 
-def is_placed(joint: int) -> bool:
-    """Return whether a joint's position follows from the predicted rotations alone."""
+def is_placed_by_trunk(joint: int) -> bool:
+    """Return whether the predicted rotations determine a joint's position."""
     parent = PARENTS[joint]
-    return parent <= ROOT or (parent in KEPT and is_placed(parent))
+    return parent <= ROOT or (parent in PREDICTED_JOINTS and is_placed_by_trunk(parent))
 
 
-PLACED = [joint for joint in range(N_JOINTS) if is_placed(joint)]
+PLACED_JOINTS = [joint for joint in range(N_JOINTS) if is_placed_by_trunk(joint)]
 
 
 class PredictedParts(NamedTuple):
-    """What the network predicts for a frame, in its own coordinates without z-scores.
+    """The network's predictions for a frame, in the network's coordinates without z-scores.
 
     Attributes:
-        sixd: the local 6D rotations (..., 11, 6) of the root and of the joints KEPT.
+        sixd: the local 6D rotations (..., 11, 6) of the root and of the joints PREDICTED_JOINTS.
         swivel: cosines and sines (..., 4, 2) of the limbs' swivels, of any size.
         ankle: both ankles relative to the head (..., 2, 3), metres.
         toe: both toes relative to their ankles (..., 2, 3), metres.
@@ -84,13 +84,13 @@ class PredictedParts(NamedTuple):
 
     @classmethod
     def from_outputs(cls, made: Tensor, normalizer: Normalizer) -> PredictedParts:
-        """Return the parts of a network's outputs (..., 86 or more)."""
-        chosen = [ROOT, *KEPT]
+        """Split a network's outputs (..., 86 or more) into parts."""
+        chosen = [ROOT, *PREDICTED_JOINTS]
         mean, std = (
             part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[chosen]
             for part in (normalizer.mean, normalizer.std)
         )
-        rotations, swivel, ankle, toe = made[..., :PREDICTED].split([6 * len(chosen), SWIVELS, 6, 6], -1)
+        rotations, swivel, ankle, toe = made[..., :PREDICTED_SIZE].split([6 * len(chosen), SWIVELS, 6, 6], -1)
         return cls(
             rotations.unflatten(-1, (len(chosen), 6)) * std + mean,
             swivel.unflatten(-1, (2, -1)).transpose(-1, -2),
@@ -99,11 +99,11 @@ class PredictedParts(NamedTuple):
 
     @property
     def trunk(self) -> Tensor:
-        """The local rotations (..., 22, 3, 3) of a body; joints that are not predicted have no rotation."""
+        """The local rotations (..., 22, 3, 3) of a body; joints without a prediction have the identity."""
         found = sixd_to_matrix(self.sixd)
         still = found.new_tensor(IDENTITY).expand(found[..., 0, :, :].shape)
         rows = [still] * N_JOINTS
-        for joint, rotation in zip((ROOT, *KEPT), found.unbind(-3), strict=True):
+        for joint, rotation in zip((ROOT, *PREDICTED_JOINTS), found.unbind(-3), strict=True):
             rows[joint] = rotation
         return torch.stack(rows, -3)
 
@@ -113,7 +113,7 @@ class PredictedParts(NamedTuple):
         return trunk, *forward_kinematics(trunk, torch.zeros_like(trunk[..., ROOT, :, 0]), rest)
 
     def solve_pose(self, encoded: Tensor, normalizer: Normalizer) -> Tensor:
-        """Return the rotations (..., 132) in network space, with the limbs solved, given inputs (..., 54)."""
+        """Solve the limbs for inputs (..., 54), and return rotations (..., 132) in network space."""
         seen = encoded * normalizer.std[:SPARSE_DIM] + normalizer.mean[:SPARSE_DIM]
         places = seen[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))
         trackers = sixd_to_matrix(seen[..., SPARSE_ROTATION].unflatten(-1, (len(TRACKED), 6)))
@@ -136,8 +136,8 @@ class PredictedParts(NamedTuple):
         return (sixd - normalizer.mean[SPARSE_DIM:][ROTATION]) / normalizer.std[SPARSE_DIM:][ROTATION]
 
 
-class Truth:
-    """The true values that the predicted parts of a frame are compared with.
+class TrueParts:
+    """The true values for comparison with the predicted parts of a frame.
 
     Args:
         motion: true motion (..., 198), in the network's coordinates without z-scores.
@@ -147,25 +147,25 @@ class Truth:
         self.sixd = motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6))
         self.joints = motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
 
-    def limbs(self) -> tuple[Tensor, Tensor, Tensor]:
+    def list_limb_joints(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the bases, middles and ends (..., 4, 3) of the limbs."""
         base, middle, end = (self.joints[..., list(joints), :] for joints in (BASES, MIDDLES, ENDS))
         return base, middle, end
 
-    def between(self, joints: tuple[int, ...], others: tuple[int, ...]) -> Tensor:
-        """Return the vectors (..., n, 3) from some joints to others."""
+    def compute_vectors(self, joints: tuple[int, ...], others: tuple[int, ...]) -> Tensor:
+        """Return the vectors (..., n, 3) from `joints` to `others`."""
         return self.joints[..., list(others), :] - self.joints[..., list(joints), :]
 
 
 class Manikin(MotionModel):
-    """The common base of both MANIKIN networks: how limbs are solved, and how the networks are trained.
+    """The base class of both MANIKIN networks, with their limb solver and training.
 
-    The losses of the motion compare the solved pose, and their gradients reach every predicted part through
-    it. The network's own losses, as its authors have them, compare the predicted parts themselves.
+    The motion losses compare the solved pose; their gradients reach every predicted part through the solver.
+    The authors' losses compare the predicted parts themselves.
 
     Attributes:
         parts_weight: weight of all losses of the parts.
-        turned: whether training windows are turned by headings drawn at random.
+        turned: whether training windows are turned by random headings.
     """
 
     parts_weight: float
@@ -175,14 +175,14 @@ class Manikin(MotionModel):
         """Map windows (B, T, 54) in network space to outputs (B, n, 86 or more) for their last n frames."""
         raise NotImplementedError
 
-    def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
-        """Return the losses of the parts in outputs (B, n, 86 or more), weighted as in the authors' work."""
+    def compute_part_losses(self, made: Tensor, true: TrueParts) -> dict[str, Tensor]:
+        """Return the parts' losses for outputs (B, n, 86 or more), with the authors' weights."""
         raise NotImplementedError
 
     def solve_pose(self, made: Tensor, encoded: Tensor) -> Tensor:
-        """Map outputs (..., 86 or more) and the same frames' inputs (..., 54) to rotations (..., 132).
+        """Map outputs (..., 86 or more) and inputs (..., 54) of the same frames to rotations (..., 132).
 
-        Limbs are solved in float32 in a mixed-precision training, too.
+        Limbs are always solved in float32.
         """
         with in_float32(made.device):
             return PredictedParts.from_outputs(made.to(encoded.dtype), self.normalizer).solve_pose(
@@ -190,7 +190,7 @@ class Manikin(MotionModel):
             )
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call in which each window is turned by its own random heading; see MotionModel."""
+        """Predict the motion of windows turned by random headings, with losses; see MotionModel."""
         inputs, kept = self.append_inputs(sparse, state)
         angle = self.turned * 2 * math.pi * distributed.draw_rows(torch.rand_like, true_frames[:, :1, :1])
         heading = torch.cat([torch.zeros_like(true_frames[:, :1, :3]), angle.cos(), angle.sin()], -1)
@@ -210,12 +210,12 @@ class Manikin(MotionModel):
             true[..., SPARSE_DIM:], self.normalizer.origin(true[..., :SPARSE_DIM])
         )
         with in_float32(made.device):
-            parts = self.compute_part_losses(made.to(true.dtype), Truth(motion[:, -made.shape[1] :]))
+            parts = self.compute_part_losses(made.to(true.dtype), TrueParts(motion[:, -made.shape[1] :]))
         return {name: self.parts_weight * term for name, term in parts.items()}
 
 
 class ManikinSGraph(AvatarPoserGraph):
-    """MANIKIN-S' streaming graph: AvatarPoser's graph, then the solver of the newest frame's limbs."""
+    """MANIKIN-S's streaming graph: AvatarPoser's graph, then the limb solver for the newest frame."""
 
     float32_modules: tuple[str, ...] = (*AvatarPoserGraph.float32_modules, "model.swivel", "model.places")
     model: ManikinS
@@ -229,9 +229,9 @@ class ManikinSGraph(AvatarPoserGraph):
 class ManikinSSettings(AvatarPoserSettings):
     """MANIKIN-S (Jiang et al. 2024): AvatarPoser's encoder predicts trunk, swivels, ankles and toes.
 
-    Arms and legs are solved in closed form, so that hands are on their trackers. Losses are those of its
-    released code, without dropout as there; heights are the world's, where that code subtracts the clip's
-    lowest foot. Training is this project's: AdamW with its schedule.
+    Arms and legs are solved in closed form, so the hands are on their trackers. Losses follow its released
+    code, which does not use dropout. Heights are world heights; the released code subtracts the clip's lowest
+    foot. Training uses AdamW with the profile's schedule.
     """
 
     dropout: float = setting(fraction(), 0.0)  # in the encoder, while training
@@ -244,18 +244,18 @@ class ManikinSSettings(AvatarPoserSettings):
 
 
 class ManikinS(Manikin, AvatarPoser):
-    """AvatarPoser's embedding and encoder, with heads for root, rotations, swivels, and ankles and toes.
+    """MANIKIN-S: AvatarPoser's encoder with heads for root, rotations, swivels, ankles and toes.
 
-    It has 4,244,566 parameters at the paper's sizes (AvatarPoser's).
+    It has 4,244,566 parameters at the paper's sizes, which are AvatarPoser's sizes.
     """
 
     graph = ManikinSGraph
-    rotated: ClassVar[int] = len(KEPT)
+    rotated_joints: ClassVar[int] = len(PREDICTED_JOINTS)
 
     def __init__(self, normalizer: Normalizer, settings: ManikinSSettings):
         super().__init__(normalizer, settings)
         self.parts_weight, self.turned = settings.parts_weight, settings.turned
-        self.swivel, self.places = head(settings.width, SWIVELS), head(settings.width, PLACES)
+        self.swivel, self.places = make_head(settings.width, SWIVELS), make_head(settings.width, PLACES)
         for added in (self.swivel, self.places):
             draw_weights(added)
 
@@ -270,32 +270,32 @@ class ManikinS(Manikin, AvatarPoser):
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.solve_pose(self.predict_parts(encoded), encoded[:, -1:])[:, 0]
 
-    def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
-        """Return the losses of the parts in outputs (B, 1, 86), weighted as in the authors' work.
+    def compute_part_losses(self, made: Tensor, true: TrueParts) -> dict[str, Tensor]:
+        """Return the parts' losses for outputs (B, 1, 86), with the authors' weights.
 
-        Swivels are measured from the predicted shoulders and hips, to which no gradient flows from them: it
-        would have no bound where a limb is nearly along the axis from which its swivel is measured, as in a
-        standing leg, and trainings diverged. The losses of middles and of swivels are sums over the limbs.
+        Swivels are measured relative to the predicted shoulders and hips, without a gradient to them. That
+        gradient has no bound if a limb is nearly parallel to its reference axis, like a standing leg, and
+        training diverged. The losses of middles and swivels are sums over the limbs.
         """
         parts = PredictedParts.from_outputs(made, self.normalizer)
         _, turned, joints = parts.pose_body(self.normalizer.rest)
-        base, middle, end = true.limbs()
+        base, middle, end = true.list_limb_joints()
         up, angle = turned[..., list(BASES), :, 1].detach(), F.normalize(parts.swivel, dim=-1)
         lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
-        rooted = (true.joints - true.joints[..., ROOT : ROOT + 1, :])[..., PLACED, :]
+        rooted = (true.joints - true.joints[..., ROOT : ROOT + 1, :])[..., PLACED_JOINTS, :]
         limbs = len(BASES)
         return {
-            "trunk_rotation": F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
-            "trunk_position": 5 * F.l1_loss(joints[..., PLACED, :], rooted),
+            "trunk_rotation": F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(PREDICTED_JOINTS), :]),
+            "trunk_position": 5 * F.l1_loss(joints[..., PLACED_JOINTS, :], rooted),
             "swivel": 0.1 * 2 * limbs * F.l1_loss(parts.swivel, measure_swivels(base, middle, end, up)),
             "middle": limbs * F.l1_loss(place_middle(base, end, up, angle, *lengths), middle),
-            "ankle": 5 * F.l1_loss(parts.ankle, true.between((HEAD,), ANKLES)),
-            "toe": 0.3 * F.l1_loss(parts.toe, true.between(ANKLES, TOES)),
+            "ankle": 5 * F.l1_loss(parts.ankle, true.compute_vectors((HEAD,), ANKLES)),
+            "toe": 0.3 * F.l1_loss(parts.toe, true.compute_vectors(ANKLES, TOES)),
         }
 
 
 class ManikinLGraph(AvatarJLMGraph):
-    """MANIKIN-L's streaming graph: AvatarJLM's graph, then the solver of the newest frame's limbs."""
+    """MANIKIN-L's streaming graph: AvatarJLM's graph, then the limb solver for the newest frame."""
 
     model: ManikinL
 
@@ -308,9 +308,9 @@ class ManikinLGraph(AvatarJLMGraph):
 class ManikinLSettings(AvatarJLMSettings):
     """MANIKIN-L (Jiang et al. 2024): AvatarJLM's network predicts trunk, swivels, ankles and toes.
 
-    Arms and legs are solved in closed form. MANIKIN-LN are the same weights with model.offline=true
-    evaluation.modes=[window] export.graph=off. Losses are those of its released code. Training is this
-    project's: AdamW with its schedule.
+    Arms and legs are solved in closed form. MANIKIN-LN uses the same weights with model.offline=true
+    evaluation.modes=[window] export.graph=off. Losses follow its released code. Training uses AdamW with the
+    profile's schedule.
     """
 
     # the weight of the losses of what the limbs are solved from: rotations, swivels, ankles, toes
@@ -323,15 +323,15 @@ class ManikinLSettings(AvatarJLMSettings):
 
 
 class ManikinL(Manikin, AvatarJLM):
-    """AvatarJLM's network, whose regressor predicts the parts and, for training only, all rotations as well.
+    """MANIKIN-L: AvatarJLM's network; its regressor predicts the parts and, in training, all rotations.
 
-    It has 63,889,240 parameters at the paper's sizes (AvatarJLM's). Its authors' MANIKIN-LN uses the same
-    weights on windows that do not overlap and takes all frames of each: it can't run as a live stream. (They
-    also raise ankles to the true floor, which is left out here.)
+    It has 63,889,240 parameters at the paper's sizes, which are AvatarJLM's sizes. The authors' MANIKIN-LN
+    uses the same weights for all frames of non-overlapping windows, so it cannot run as a live stream. Its
+    raising of ankles to the true floor is left out here.
     """
 
     graph = ManikinLGraph
-    outputs: ClassVar[int] = PREDICTED + AUXILIARY
+    outputs: ClassVar[int] = PREDICTED_SIZE + AUXILIARY_SIZE
 
     def __init__(self, normalizer: Normalizer, settings: ManikinLSettings):
         super().__init__(normalizer, settings)
@@ -349,23 +349,24 @@ class ManikinL(Manikin, AvatarJLM):
         """Return the weighted losses of the parts and of the coarse pose; see Manikin."""
         return super().compute_losses(made, true) | self.compute_coarse_loss(true)
 
-    def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
-        """Return the losses of the parts in outputs (B, T, 212), weighted as in the authors' work.
+    def compute_part_losses(self, made: Tensor, true: TrueParts) -> dict[str, Tensor]:
+        """Return the parts' losses for outputs (B, T, 212), with the authors' weights.
 
-        Swivels are compared as angles, measured from the true shoulders and hips. Toes are compared with the
+        Swivels are compared as angles relative to the true shoulders and hips. Toes are compared with the
         head on its tracker.
         """
         parts = PredictedParts.from_outputs(made, self.normalizer)
         turned, _ = forward_kinematics(
             sixd_to_matrix(true.sixd), torch.zeros_like(true.joints[..., ROOT, :]), self.normalizer.rest
         )
-        wanted = measure_swivels(*true.limbs(), turned[..., list(BASES), :, 1])
+        wanted = measure_swivels(*true.list_limb_joints(), turned[..., list(BASES), :, 1])
         (x, y), (cosine, sine) = parts.swivel.unbind(-1), wanted.unbind(-1)
-        toe = true.between((HEAD,), TOES)
+        toe = true.compute_vectors((HEAD,), TOES)
         return {
-            "trunk_rotation": 2 * F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
+            "trunk_rotation": 2
+            * F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(PREDICTED_JOINTS), :]),
             "swivel": 0.1 * torch.atan2(y * cosine - x * sine, x * cosine + y * sine).abs().mean(),
-            "ankle": 5 * F.l1_loss(parts.ankle, true.between((HEAD,), ANKLES)),
+            "ankle": 5 * F.l1_loss(parts.ankle, true.compute_vectors((HEAD,), ANKLES)),
             "toe": 5 * F.l1_loss(parts.ankle + parts.toe, toe),
-            "auxiliary": 2 * F.l1_loss(made[..., PREDICTED:], true.sixd[..., 1:, :].flatten(-2)),
+            "auxiliary": 2 * F.l1_loss(made[..., PREDICTED_SIZE:], true.sixd[..., 1:, :].flatten(-2)),
         }

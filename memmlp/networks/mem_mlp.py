@@ -25,18 +25,18 @@ from memmlp.networks.motion_model import (
     slide_window,
 )
 from memmlp.networks.predictor import Branch, Predictor
-from memmlp.networks.streaming import OneFrameNormalizer, linear
+from memmlp.networks.streaming import OneFrameNormalizer, make_linear
 from memmlp.networks.vqvae import VQVAE
 
 
 class StreamingBlock(nn.Module):
     """An MLP block of a streaming graph.
 
-    A memory feature enters it as a contribution that is computed in advance: in [h; z] W = h W_h + z W_z,
-    the part z W_z is known when a frame enters.
+    A memory feature's contribution is computed in advance: in [h; z] W = h W_h + z W_z, the term z W_z is
+    known when a frame enters.
 
     Args:
-        block: the network's block; in a memory block, its fusion.
+        block: the network's block, or a memory block's fusion.
         index: the index of the block's contribution; None for a block without memory.
 
     Attributes:
@@ -54,16 +54,16 @@ class StreamingBlock(nn.Module):
         if index is not None:
             name = "merge" if self.plain else "linear"
             layer, hidden = getattr(block, name), block.norm.normalized_shape[0]
-            setattr(self, name, linear(layer.weight[:, :hidden]))
-            self.feature_part = linear(layer.weight[:, hidden:], layer.bias)
+            setattr(self, name, make_linear(layer.weight[:, :hidden]))
+            self.feature_part = make_linear(layer.weight[:, hidden:], layer.bias)
 
     def forward(self, h: Tensor, contributions: Sequence[Tensor], newest: bool = False) -> Tensor:
         """Map the hidden state (T, d) to the block's output (T, d).
 
         Args:
             h: the hidden state (T, d).
-            contributions: what each memory block's feature adds to its linear layer, a window (T, d) each.
-            newest: whether only the newest frame's output (1, d) is computed.
+            contributions: for each memory block, its feature's contribution to the linear layer (T, d).
+            newest: whether to compute only the newest frame's output (1, d).
         """
 
         def take(window: Tensor) -> Tensor:
@@ -80,8 +80,8 @@ class StreamingBlock(nn.Module):
         return h + F.silu(made + contribution)
 
 
-class StreamedBranch(nn.Module):
-    """A predictor's branch whose last block, if any, and linear layer compute the newest frame alone."""
+class StreamingBranch(nn.Module):
+    """A predictor's branch in a streaming graph; its last layers compute only the newest frame."""
 
     def __init__(self, blocks: Sequence[StreamingBlock], linear: nn.Linear):
         super().__init__()
@@ -107,7 +107,7 @@ class MemMLPGraph(StreamingGraph):
 
     @classmethod
     def fits(cls, model: Any) -> bool:
-        """Return whether the predictor is made of branches; no other predictor can be streamed."""
+        """Return whether the predictor consists of branches; other predictors cannot be streamed."""
         return all(isinstance(part, Branch) for part in model.predictor.children())
 
     def build(self, model: Any) -> None:
@@ -127,12 +127,12 @@ class MemMLPGraph(StreamingGraph):
         self.blocks = nn.ModuleList(map(convert, model.blocks))
         self.predictor = model.predictor
         for name, branch in list(model.predictor.named_children()):
-            setattr(self.predictor, name, StreamedBranch(list(map(convert, branch.blocks)), branch.linear))
+            setattr(self.predictor, name, StreamingBranch(list(map(convert, branch.blocks)), branch.linear))
         self.recall = model.memory.streaming_recall(model.memory, features, parts)
         self.contributions = [f"memory.{index}" for index in range(len(parts))]
 
     def windows(self) -> State:
-        """Return zeros: windows (T, d) of stem outputs and of contributions, and the memory's state."""
+        """Return zeros for windows (T, d) of stem outputs and contributions, and the memory's state."""
         memory, window = self.recall.memory, torch.zeros(self.frames, self.stem.out_features)
         return {
             "sparse": torch.zeros(1, memory.past_frames, SPARSE_DIM),
@@ -161,7 +161,7 @@ class MemMLPGraph(StreamingGraph):
 @component("model", "mem_mlp", builds="MemMLP")
 @dataclass
 class MemMLPSettings(Settings):
-    """Mem-MLP's backbone (Sec. 3.2, readings 1 and 2), with slots for memory, predictor and hand term."""
+    """Mem-MLP's backbone (Sec. 3.2), with slots for memory, predictor and hand term."""
 
     frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
     # d, the width of the hidden state
@@ -189,11 +189,11 @@ class MemMLPSettings(Settings):
         if getattr(loss, "complete", False):
             name, alone = config["loss"]["name"], "predictor=rotation_only hand=off"
             if not getattr(loss, "rotations_alone", False):
-                yield f"loss={name}: must be uncertainty or manual, or a loss of rotations alone with {alone}"
+                yield f"loss={name}: must be uncertainty or manual, or with {alone} a rotation-only loss"
             elif getattr(predictor, "positions", True) or config["hand"]["name"] != "off":
                 yield f"loss={name}: must be uncertainty or manual, since it needs {alone}"
         if getattr(predictor, "memory_blocks", False) and not layers:
-            yield f"predictor={config['predictor']['name']}: must have no memory blocks with memory=none"
+            yield f"predictor={config['predictor']['name']}: must not have memory blocks with memory=none"
         if memory["name"] == "none" and rollout["name"] == "own_predictions":
             yield "rollout=own_predictions: must be teacher_forcing or streams with memory=none"
         passes, frames = rollout.get("max_passes", model["frames"]), model["frames"]
@@ -203,7 +203,7 @@ class MemMLPSettings(Settings):
                 "memory.shift=frame, since a call fills one frame; or set memory.shift=window"
             )
         if config["evaluation"]["ik"] == "lbfgs" and not getattr(predictor, "positions", True):
-            yield "evaluation.ik=lbfgs: must be off or arms, since the predictor has no positions"
+            yield "evaluation.ik=lbfgs: must be off or arms, since the predictor does not have positions"
 
 
 class MemMLP(MotionModel):
@@ -211,8 +211,8 @@ class MemMLP(MotionModel):
 
     Args:
         normalizer: converts between the world and network space.
-        memory: what fills the memory slot.
-        predictor: what fills the predictor slot.
+        memory: the memory in the memory slot.
+        predictor: the predictor in the predictor slot.
         frames: T, the window's length.
         hidden: d, the width of the hidden state.
         depth: L, the number of the backbone's blocks.
@@ -248,11 +248,11 @@ class MemMLP(MotionModel):
         memory: Callable[..., Memory],
         predictor: Callable[..., Predictor],
     ) -> MemMLP:
-        """Build the network with fresh weights.
+        """Build the network with random weights.
 
         Args:
             normalizer: converts between the world and network space.
-            codes: the frozen VQ-VAE, where the memory uses one.
+            codes: the frozen VQ-VAE; None if the memory does not use one.
             settings: the backbone's sizes.
             memory: makes the memory, given `codes`, `depth`, `hidden` and `frames`.
             predictor: makes the predictor, given `memory_block`, `hidden` and `frames`.
@@ -264,28 +264,28 @@ class MemMLP(MotionModel):
 
     @property
     def past_frames(self) -> int:
-        """How many past frames of inputs the memory needs in the buffer."""
+        """The number of past input frames that the memory needs in the buffer."""
         return self.memory.past_frames
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start, all zeros.
+        """Return the initial state, all zeros.
 
-        At the first call the first frame's inputs stand for those of all frames before it.
+        In the first call, the first frame's inputs replace all earlier inputs.
         """
         kept = self.memory.initial_state(batch)
         return super().initial_state(batch) | {name: t.to(self.normalizer.mean) for name, t in kept.items()}
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after world frames [X | Theta] (B, past, 252), with the truth as its history."""
+        """Return the state after world frames [X | Theta] (B, past, 252), with true history."""
         encoded = self.normalizer.encode(frames)
         true = self.memory.true_state(encoded[..., :SPARSE_DIM], encoded[..., SPARSE_DIM:])
         return super().true_state(frames) | true
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see MotionModel.
+        """Process the newest frames; see MotionModel.
 
-        By default all T frames are returned. If fewer are wanted, the predictor's last blocks skip the
-        others.
+        By default all T frames are returned. If fewer frames are requested, the predictor's last blocks skip
+        the remaining frames.
         """
         new = sparse.shape[1]
         inputs, kept = self.append_inputs(sparse, state)
@@ -302,6 +302,6 @@ class MemMLP(MotionModel):
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call; a memory whose VQ-VAE trains with the network adds losses of its own."""
+        """Predict the motion; a jointly trained VQ-VAE adds its losses."""
         motion, kept = self.advance(sparse, state)
         return TrainingOutputs(motion, kept, self.memory.auxiliary_losses(true_frames, self.normalizer))

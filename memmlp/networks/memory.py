@@ -1,8 +1,8 @@
-"""The memory slot: what the backbone sees of the past, and what it keeps for the next call.
+"""The memory slot: what the backbone sees of the past, and its state for the next call.
 
-A memory makes the backbone's blocks (`block`), turns the buffers of past frames into what those blocks see
-(`recall`), and updates its buffers with the network's output (`remember`). All of these values are in network
-space. Here are the interface, and memories of recurrent layers, which replace the paper's memory (Table 15).
+A memory makes the backbone's blocks (`make_block`), computes the blocks' view of the past from its buffers
+(`recall`), and updates its buffers with the network's output (`remember`). All values are in network space.
+This module has the interface and the recurrent memories, which replace the paper's memory (Table 15).
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from memmlp.networks.vqvae import VQVAE
 
 
 class Past(NamedTuple):
-    """What a memory of the network's own past recalls: the T frames that end one shift before the newest.
+    """The recalled past of the network: the T frames that end one shift before the newest frame.
 
     Attributes:
         sparse: inputs (B, T, 54).
         motion: the network's motion (B, T, 198).
-        codes: code-vectors (B, T, width), of width 0 for a memory without them.
+        codes: code-vectors (B, T, width); width is 0 for a memory without code-vectors.
     """
 
     sparse: Tensor
@@ -42,7 +42,7 @@ class Past(NamedTuple):
 
 
 class RecurrentPast(NamedTuple):
-    """What a recurrent memory recalls.
+    """The recalled values of a recurrent memory.
 
     Attributes:
         features: SiLU of the recurrent layers' outputs in the window (B, blocks, T, k).
@@ -54,11 +54,11 @@ class RecurrentPast(NamedTuple):
 
 
 class MemoryBlock(nn.Module):
-    """A block that computes a memory feature from the recalled past, and takes that feature in.
+    """A block that computes a memory feature from the recalled past, and fuses it with the hidden state.
 
     Args:
         feature: computes the feature (B, T, k).
-        fusion: the MLP block that takes it in.
+        fusion: the MLP block that fuses the feature.
     """
 
     def __init__(self, feature: nn.Module, fusion: ResidualFusion | PlainFusion):
@@ -72,11 +72,11 @@ class MemoryBlock(nn.Module):
 
 
 class Recall(nn.Module):
-    """Computes, for each memory block, what the recalled feature adds to it at a step of a stream.
+    """Computes the contributions of recalled features to the memory blocks at a stream's step.
 
     Args:
         memory: the network's memory.
-        features: the feature modules of its memory blocks.
+        features: the feature modules of the memory blocks.
         parts: the layers that map each block's feature (1, k) to its contribution (1, d).
     """
 
@@ -87,28 +87,28 @@ class Recall(nn.Module):
         self.memory.frames, self.memory.past_frames = 1, memory.past_frames - memory.frames + 1
         self.parts = nn.ModuleList(parts)
         if features:
-            self.join(features)
+            self.merge_features(features)
 
-    def join(self, features: Sequence[Any]) -> None:
-        """Join the blocks' feature modules into one that computes a frame's features for all of them."""
+    def merge_features(self, features: Sequence[Any]) -> None:
+        """Merge the blocks' feature modules into one module for all blocks."""
 
     def forward(self, past: Past | RecurrentPast | None) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """Return each block's contribution (1, d): of the entering frame, and of frames before the first."""
+        """Return the blocks' contributions (1, d) for the new frame, and for frames before the first."""
         if not self.parts:
             return (), ()
         z = self.compute_features(past)
-        before, made = self.compute_earlier(z), self._multiply(z)
-        return made, made if before is z else self._multiply(before)
+        before, made = self.compute_features_before_start(z), self._compute_contributions(z)
+        return made, made if before is z else self._compute_contributions(before)
 
     def compute_features(self, past: Any) -> Tensor:
-        """Return the features (1, blocks, k) of the frame that enters."""
+        """Return the features (1, blocks, k) of the new frame."""
         raise NotImplementedError
 
-    def compute_earlier(self, first: Tensor) -> Tensor:
-        """Return the features of frames before the first one, given the first one's (1, blocks, k)."""
+    def compute_features_before_start(self, first: Tensor) -> Tensor:
+        """Return features of frames before the first frame, from its features (1, blocks, k)."""
         return first
 
-    def _multiply(self, z: Tensor) -> Sequence[Tensor]:
+    def _compute_contributions(self, z: Tensor) -> Sequence[Tensor]:
         return [part(of) for part, of in zip(self.parts, z.flatten(0, 1).split(1), strict=True)]
 
 
@@ -116,7 +116,7 @@ FUSIONS: dict[str, type[ResidualFusion | PlainFusion]] = {"residual": ResidualFu
 
 
 class Memory(nn.Module):
-    """The memory slot's interface; in this base class nothing is kept and nothing is recalled.
+    """The memory slot's interface; this base class has no state and recalls nothing.
 
     Args:
         hidden: the backbone's d.
@@ -125,13 +125,13 @@ class Memory(nn.Module):
         codes: the frozen VQ-VAE; not used here.
 
     Attributes:
-        shift: how many frames before the newest one the recalled past ends, which is also how many frames a
-            training step moves on; 0 without a past.
-        past_frames: how many past frames of inputs the buffer holds; the last one directly precedes the new.
+        shift: number of frames from the end of the recalled past to the newest frame; 0 without a past. A
+            training step advances by the same number of frames.
+        past_frames: number of past input frames in the buffer, which ends just before the new frames.
         frames: T, the window's length.
-        settled: whether what is recalled of a frame never changes, so that a stream may compute it once. For
-            a custom memory that does not set it, only the graph of the network as trained can be exported.
-        streaming_recall: what computes the blocks' contributions in a streaming graph.
+        settled: whether a frame's recalled values never change, so that a stream may compute them once. A
+            custom memory must set it to be exported as a streaming graph.
+        streaming_recall: the class that computes the blocks' contributions in a streaming graph.
     """
 
     streaming_recall: ClassVar[type[Recall]] = Recall
@@ -144,15 +144,15 @@ class Memory(nn.Module):
         self.shift, self.past_frames = 0, frames - 1
 
     def make_block(self, layer: int) -> nn.Module:
-        """Make the backbone's block of a layer (1-based); by default one without memory."""
+        """Make the backbone's block for a layer (1-based); by default a block without memory."""
         return MLPBlock(self.hidden, self.frames)
 
     def make_memory_block(self) -> nn.Module:
-        """Make one more block that takes in a memory feature, for the predictor's branches (Table 8)."""
-        raise InputError("memory: must have memory blocks for this predictor, which uses them")
+        """Make a memory block for the predictor's branches (Table 8)."""
+        raise InputError("memory: must have memory blocks, since the predictor uses them")
 
     def initial_state(self, batch: int) -> State:
-        """Return the memory's state at a fresh start: zeros."""
+        """Return the memory's initial state, zeros."""
         return {}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
@@ -160,16 +160,16 @@ class Memory(nn.Module):
         return {}
 
     def count_needed(self, new: int) -> int:
-        """Return how many of the output's newest frames `remember` looks at."""
+        """Return the number of newest output frames that `remember` needs."""
         return 0
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Past | RecurrentPast | None:
-        """Return what the memory blocks see of the past.
+        """Return the past for the memory blocks.
 
         Args:
             sparse: inputs (B, past + new, 54) in network space.
-            state: what the last call returned, or `initial_state`.
-            new: how many of the inputs are new.
+            state: the state from the last call, or `initial_state`.
+            new: number of new frames, the last of the inputs.
         """
         return None
 
@@ -178,9 +178,9 @@ class Memory(nn.Module):
 
         Args:
             motion: output (B, n, 198), n at least `count_needed(new)`.
-            past: what `recall` returned.
+            past: the result of `recall`.
             state: the state before the new frames.
-            new: how many of the output's last frames are new.
+            new: number of new frames, the last of the output.
         """
         return {}
 
@@ -198,7 +198,7 @@ class NoMemory(Memory):
 
 @dataclass
 class FeatureMemorySettings(Settings):
-    """The keys of the memories that give some blocks a feature to take in."""
+    """The keys of memories that provide a feature for some blocks."""
 
     # which blocks of the backbone have it: the even ones (Sec. 4.1)
     layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
@@ -209,15 +209,15 @@ class FeatureMemorySettings(Settings):
 
 
 class FeatureMemory(Memory):
-    """A memory that gives some blocks a feature to take in.
+    """A memory that provides a feature for some blocks.
 
     Args:
-        settings: the memory's keys, of which `layers`, `width` and `fusion` are used here.
+        settings: the memory's keys; this class uses `layers`, `width` and `fusion`.
         depth: the backbone's L.
         sizes: the other arguments of Memory.
 
     Raises:
-        InputError: if a layer is not one of the backbone's.
+        InputError: if the backbone does not have a layer.
     """
 
     def __init__(self, settings: Any, *, depth: int, **sizes: Any):
@@ -233,12 +233,12 @@ class FeatureMemory(Memory):
         return MemoryBlock(self.make_feature(), self.fusion(self.hidden, self.frames, self.width))
 
     def make_feature(self) -> nn.Module:
-        """Make the module that computes a block's memory feature from what `recall` returns."""
+        """Make the module that computes a block's memory feature from the recalled past."""
         raise NotImplementedError
 
 
 class Recurrence(nn.Module):
-    """LayerNorm of the sparse features, a recurrent layer, SiLU (App. A, reading 19).
+    """LayerNorm of the sparse features, a recurrent layer, SiLU (App. A; docs/readings.md, no. 19).
 
     Args:
         kind: the class of the recurrent layer, nn.LSTM or nn.GRU.
@@ -251,12 +251,12 @@ class Recurrence(nn.Module):
         self.first = nn.Linear(SPARSE_DIM, width)
         self.layer: nn.Module = kind(SPARSE_DIM, width, batch_first=True)
 
-    def begin(self, sparse: Tensor) -> Tensor:
-        """Map the input (B, 54) just before a training window to the hidden state (B, k) to start from."""
+    def project_first_state(self, sparse: Tensor) -> Tensor:
+        """Map the input (B, 54) just before a training window to the initial hidden state (B, k)."""
         return self.first(self.norm(sparse))
 
     def forward(self, sparse: Tensor, carried: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """Run over the inputs (B, n, 54) from the carried states, each (B, k), the hidden one first.
+        """Run over the inputs (B, n, 54) from the carried states, each (B, k), the hidden state first.
 
         Returns:
             Features (B, n, k), and the states after the last input.
@@ -281,9 +281,9 @@ class RecurrentFeature(nn.Module):
 
 
 class RecurrentRecall(Recall):
-    """Recall for recurrent memories, whose features before the first frame are zeros."""
+    """Recall for recurrent memories; features before the first frame are zeros."""
 
-    def join(self, features: Sequence[Any]) -> None:
+    def merge_features(self, features: Sequence[Any]) -> None:
         """Note the index of each block's recurrent layer, and replace GRUs by plain layers."""
         self.layers = [feature.index for feature in features]
         assert isinstance(self.memory, RecurrentMemory)
@@ -295,19 +295,19 @@ class RecurrentRecall(Recall):
         newest = past.features[:, :, -1]
         return newest.index_select(1, torch.tensor(self.layers, device=newest.device))
 
-    def compute_earlier(self, first: Tensor) -> Tensor:
+    def compute_features_before_start(self, first: Tensor) -> Tensor:
         """Return zeros, since the layers have seen nothing before the first frame."""
         return torch.zeros_like(first)
 
 
 class RecurrentMemory(FeatureMemory):
-    """A recurrent layer for each memory block in place of the paper's memory (Table 15, reading 19).
+    """A recurrent layer for each memory block, instead of the paper's memory (Table 15).
 
-    A layer runs once over each frame, and its outputs for the window's older frames are kept with its states.
-    So a stream in single frames is the same as one in larger steps. A training call sees a whole window. With
-    teacher forcing the hidden state starts from the last input before the window, projected, and the cell at
-    zero (`true_state`). Otherwise, and in evaluation, the states are carried from call to call and are zeros
-    at a fresh start.
+    A layer runs once over each frame. Its states and its outputs for the window's older frames are carried,
+    so a stream gives the same result for any step size. A training call sees a whole window. With teacher
+    forcing the hidden state is a projection of the last input before the window, and the cell is zero
+    (`true_state`). Otherwise, and in evaluation, the states are carried from call to call, initially zeros.
+    See docs/readings.md, no. 19.
 
     Args:
         settings: the memory's keys; k is also the hidden size of the recurrent layers.
@@ -325,23 +325,23 @@ class RecurrentMemory(FeatureMemory):
         self.shift = self.frames
 
     def make_feature(self) -> nn.Module:
-        """Add one more recurrent layer and make the module that looks up its output."""
+        """Add a recurrent layer, and make the module that looks up the layer's output."""
         self.recurrences.append(Recurrence(self.layer, self.width))
         return RecurrentFeature(len(self.recurrences) - 1)
 
     def initial_state(self, batch: int) -> State:
-        """Return zeros: states (B, blocks, k), and the earlier frames' features (B, blocks, T - 1, k)."""
+        """Return zeros: states (B, blocks, k), and features of earlier frames (B, blocks, T - 1, k)."""
         blocks = len(self.recurrences)
         states = {name: torch.zeros(batch, blocks, self.width) for name in self.carried}
         return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
         """Return hidden states projected from the last of the inputs (B, past, 54), for teacher forcing."""
-        hidden = [cast(Recurrence, one).begin(sparse[:, -1]) for one in self.recurrences]
+        hidden = [cast(Recurrence, one).project_first_state(sparse[:, -1]) for one in self.recurrences]
         return {"hidden": torch.stack(hidden, 1).float()}
 
     def recall(self, sparse: Tensor, state: State, new: int) -> RecurrentPast:
-        """Run the layers over the `new` last inputs of (B, past + new, 54), and recall the window."""
+        """Run the layers over the last `new` inputs of (B, past + new, 54), and return the window."""
         features, states = [], []
         for index, recurrence in enumerate(self.recurrences):
             made, after = recurrence(sparse[:, -new:], [state[name][:, index] for name in self.carried])
@@ -360,16 +360,17 @@ class RecurrentMemory(FeatureMemory):
 @component("memory", "lstm", builds="LSTMMemory")
 @dataclass
 class LSTMMemorySettings(FeatureMemorySettings):
-    """An LSTM for each memory block (Table 15, reading 19): LayerNorm of the sparse features, LSTM, SiLU.
+    """An LSTM for each memory block (Table 15): LayerNorm of the sparse features, LSTM, SiLU.
 
-    Teacher forcing starts its states from the input before the window; evaluation carries them on.
+    Teacher forcing projects its initial state from the input before the window. Evaluation carries the
+    states. See docs/readings.md, no. 19.
     """
 
 
 @component("memory", "gru", builds="GRUMemory")
 @dataclass
 class GRUMemorySettings(LSTMMemorySettings):
-    """A GRU for each memory block (Table 15, reading 19), in place of the LSTM of memory=lstm."""
+    """A GRU for each memory block (Table 15), instead of the LSTM of memory=lstm."""
 
 
 class LSTMMemory(RecurrentMemory):

@@ -1,4 +1,4 @@
-"""The interface of every network, and of its streaming graph, from which the live step is exported."""
+"""The interfaces of networks and of their streaming graphs, which are exported for live use."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ State = dict[str, Tensor]
 
 
 class TrainingOutputs(NamedTuple):
-    """What a training call returns.
+    """The results of `MotionModel.training_call`.
 
     Attributes:
-        motion: (B, n, 198) in the world, to be compared with the true motion of the window's last n frames. A
-            network whose members each learn by themselves returns the motion of all members, one after the
-            other: (members B, n, 198).
+        motion: world motion (B, n, 198) for comparison with the true motion of the window's last n frames. An
+            ensemble with separately trained networks returns their motions one after the other: (networks x
+            B, n, 198).
         state: the new state.
-        losses: the network's own further losses, weighted, which are added to the motion's losses.
+        losses: additional weighted losses of the network, which are added to the motion losses.
     """
 
     motion: Tensor
@@ -31,26 +31,29 @@ class TrainingOutputs(NamedTuple):
 
 
 class MotionModel(nn.Module):
-    """A network that takes in frames by calls of `advance`; the interface of all networks.
+    """The interface of all networks, which process frames by calls of `advance`.
 
     Evaluation, export, timing and training use only this interface. In this base class a network sees a
-    window, the last T frames, and its state is only the buffer of past inputs. WindowlessModel has no buffer.
+    window, the last T frames, and its state is only the buffer of past inputs. WindowlessModel does not have
+    a buffer.
 
     Args:
         normalizer: converts between the world and network space.
         frames: T, the window's length.
 
     Attributes:
-        branches: the parts of the motion that are learned, out of "rotation" and "position"; positions that
-            are not learned follow from the rotations.
-        graph: the class of the streaming graph, or None. A subclass names its own, since it may compute
-            something else than its base.
-        shift: how many frames before the newest one the recalled past ends; 0 without a recalled past.
-        settled: whether recalled values of a past frame never change, so that a live stream may keep them.
+        branches: the learned quantities, out of "rotation" and "position". Without learned positions, forward
+            kinematics gives them.
+        graph: the class of the streaming graph, or None. It is not inherited, since a subclass may compute
+            something else.
+        shift: number of frames from the end of the recalled past to the newest frame; 0 without a recalled
+            past.
+        settled: whether the recalled values of a past frame never change, so that a live stream may keep
+            them.
         windowless: whether the network is a stream in both evaluation modes; see WindowlessModel.
-        is_stream: whether it needs no future frames; if it does, only window mode can evaluate it.
-        takes_whole_clip: whether window mode passes a whole clip to `predict_clip`, which predicts all its
-            windows together; they may overlap.
+        is_stream: whether the network runs without future frames. If not, only window mode can evaluate it.
+        takes_whole_clip: whether window mode passes a whole clip to `predict_clip`, which may overlap
+            windows.
     """
 
     branches: frozenset[str] = frozenset({"rotation"})
@@ -68,54 +71,53 @@ class MotionModel(nn.Module):
 
     @property
     def past_frames(self) -> int:
-        """How many past frames of inputs the buffer holds; the last one directly precedes the new ones."""
+        """The number of past input frames in the buffer, which ends just before the new frames."""
         return self.frames - 1
 
     @property
     def stride(self) -> int:
-        """By how many frames a training step moves on: the shift, or 1 for a network without a past."""
+        """The number of frames by which a training step advances: the shift, or 1 without a past."""
         return max(self.shift, 1)
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start, all zeros.
+        """Return the initial state, all zeros.
 
-        At the first call the first frame's inputs stand for those of all frames before it.
+        In the first call, the first frame's inputs replace all earlier inputs.
         """
         state = {"sparse": torch.zeros(batch, self.past_frames, SPARSE_DIM), "started": torch.zeros(batch, 1)}
         return {name: tensor.to(self.normalizer.mean) for name, tensor in state.items()}
 
     def running_state(self, sparse: Tensor) -> State:
-        """Return the state after world inputs (B, past, 54), without any history of motion yet."""
+        """Return the state after world inputs (B, past, 54), without a history of motion."""
         fresh = self.initial_state(len(sparse))
         return fresh | {"sparse": sparse, "started": torch.ones_like(fresh["started"])}
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after true world frames [X | Theta] (B, past, 252), the truth as its history."""
+        """Return the state after world frames [X | Theta] (B, past, 252), with true history."""
         return self.running_state(frames[..., :SPARSE_DIM])
 
     def append_inputs(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
-        """Return past and new inputs together (B, past + n, 54), and the buffers after them.
+        """Return past and new inputs together (B, past + n, 54), and the new buffers.
 
         Args:
             sparse: new world inputs (B, n, 54).
-            state: what the last call returned, or `initial_state`.
+            state: the state from the last call, or `initial_state`.
         """
         before = torch.where(state["started"][..., None] > 0, state["sparse"], sparse[:, :1])
         inputs = torch.cat([before, sparse], 1)
         return inputs, {"sparse": inputs[:, -self.past_frames :], "started": state["started"].clamp_min(1)}
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames.
+        """Process the newest frames.
 
         Args:
             sparse: world inputs (B, n, 54) of the n newest frames: n is 1 for a live stream, T for windows,
                 and fewer at a clip's end.
-            state: what the last call returned, or `initial_state`.
-            newest: how many of the newest frames are wanted; by default all that the network predicts.
+            state: the state from the last call, or `initial_state`.
+            newest: number of newest frames to return; by default all frames that the network predicts.
 
         Returns:
-            Motion (B, newest, 198) in the world, of the frames that end with the newest one, and the new
-            state.
+            World motion (B, newest, 198) of the newest frames, and the new state.
         """
         raise NotImplementedError
 
@@ -124,7 +126,7 @@ class MotionModel(nn.Module):
         raise NotImplementedError
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call; by default this is `advance`.
+        """Predict the motion for a training step, with additional losses; by default this is `advance`.
 
         Args:
             sparse: see `advance`.
@@ -136,51 +138,52 @@ class MotionModel(nn.Module):
     def count_parameters(self) -> int:
         """Count the trainable parameters; tables show this number in millions.
 
-        A frozen VQ-VAE is not counted; one that is trained with the network is, its decoder included.
+        A frozen VQ-VAE is not counted. A jointly trained VQ-VAE is counted with its decoder.
         """
         return sum(p.numel() for p in self.parameters() if p.requires_grad)
 
 
 class WindowlessModel(MotionModel):
-    """A network that carries all it knows of the past in its state; every live step takes the same work.
+    """A network without a window: its state holds everything about the past.
 
-    `frames` is how many frames a training call takes in, from a fresh start. In both evaluation modes the
-    network is a stream over the whole clip. By default `advance` returns the motion of the n new frames; more
-    than these cannot be predicted.
+    Every live step costs the same. `frames` is the number of frames in a training step, from the initial
+    state. In both evaluation modes the network is a stream over the whole clip. By default `advance` returns
+    the motion of the n new frames, which is the maximum.
     """
 
     windowless = True
 
     @property
     def past_frames(self) -> int:
-        """How many past frames of inputs are kept in a buffer; 0 here."""
+        """The number of past input frames in the buffer: 0."""
         return 0
 
     @property
     def stride(self) -> int:
-        """By how many frames a training step moves on: by all that it takes in."""
+        """The number of frames by which a training step advances: all frames of the step."""
         return self.frames
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start, all zeros; by default nothing is carried."""
+        """Return the initial state, all zeros; by default it is empty."""
         return {}
 
     def running_state(self, sparse: Tensor) -> State:
-        """Return the state of a fresh start, since no earlier frames (B, 0, 54) are kept."""
+        """Return the initial state, because earlier frames (B, 0, 54) are not kept."""
         return self.initial_state(len(sparse))
 
 
 class WindowModel(MotionModel):
-    """The base of networks that map a whole window of inputs to its rotations (`predict_rotations`)."""
+    """The base class of networks that map a window of inputs to its rotations (`predict_rotations`)."""
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         raise NotImplementedError
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see MotionModel.
+        """Process the newest frames; see MotionModel.
 
-        By default all T frames are returned. The work is always that of the whole window, as published.
+        By default all T frames are returned. The whole window is always computed, as in the published
+        networks.
         """
         inputs, kept = self.append_inputs(sparse, state)
         window = inputs[:, -self.frames :]
@@ -192,9 +195,9 @@ class WindowModel(MotionModel):
 
 
 class NewestFrameModel(MotionModel):
-    """The base of networks that predict every frame from the window that ends with it (`predict_rotations`).
+    """The base class of networks that predict only the newest frame of a window (`predict_rotations`).
 
-    Both evaluation modes give the same numbers, to rounding.
+    Both evaluation modes give the same numbers, except for rounding.
     """
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
@@ -202,9 +205,9 @@ class NewestFrameModel(MotionModel):
         raise NotImplementedError
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see MotionModel.
+        """Process the newest frames; see MotionModel.
 
-        By default the n new frames are returned, which are the most that this network can make.
+        By default the n new frames are returned, which is the maximum for this network.
         """
         inputs, kept = self.append_inputs(sparse, state)
         wanted = sparse.shape[1] if newest is None else newest
@@ -217,36 +220,35 @@ class NewestFrameModel(MotionModel):
 
 
 def fill_past(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
-    """Return a window's earlier frames, which at a fresh start are all copies of the first frame.
+    """Return a window's earlier frames; in a stream's first step they are copies of the first frame.
 
-    The carried frames are zeros then, so a sum is enough; a condition is not available in every runtime.
+    In the first step the carried frames are zeros, so a sum is enough. Not every runtime has conditions.
 
     Args:
         earlier: the carried frames (n, size).
-        first: the copy that stands for earlier frames (1, size).
-        fresh: 1 at a fresh start and 0 after it (1,).
+        first: the frame that replaces earlier frames (1, size).
+        fresh: 1 in a stream's first step, else 0 (1,).
     """
     return earlier + fresh * first
 
 
 def slide_window(window: Tensor, entering: Tensor, before: Tensor, fresh: Tensor) -> Tensor:
-    """Return a window (T, size) without its oldest frame and with a new one (1, size) at its end.
+    """Return a window (T, size) without its oldest frame, and with a new last frame (1, size).
 
-    At a fresh start `before` (1, size) stands for the frames before it; see `fill_past`.
+    In a stream's first step `before` (1, size) replaces all earlier frames; see `fill_past`.
     """
     return torch.cat([fill_past(window[1:], before, fresh), entering])
 
 
 class StreamingGraph(nn.Module):
-    """A network as a graph for one live stream, without gradients; the interface of all of them.
+    """The interface of streaming graphs: a network as a graph for one live stream, without gradients.
 
     Args:
         model: the trained network; the graph is made from a copy.
 
     Attributes:
-        float32_modules: names of the modules that stay in float32 when the graph is quantised: those at the
-            network's two ends, from the inputs to the hidden state and from there to the motion, and others
-            whose rounding would be visible.
+        float32_modules: names of the modules that stay in float32 when the graph is quantised. They are the
+            network's first and last layers, and other layers with visible rounding.
     """
 
     float32_modules: tuple[str, ...]
@@ -260,7 +262,7 @@ class StreamingGraph(nn.Module):
 
     @classmethod
     def fits(cls, model: MotionModel) -> bool:
-        """Return whether this graph can stream this very model: its memory, its sizes."""
+        """Return whether this graph supports the given model, with its memory and sizes."""
         return True
 
     def build(self, model: Any) -> None:
@@ -268,13 +270,13 @@ class StreamingGraph(nn.Module):
         raise NotImplementedError
 
     def windows(self) -> State:
-        """Return the state of a fresh start, without the count of steps: zeros."""
+        """Return the initial state without the step count, all zeros."""
         raise NotImplementedError
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start, all zeros.
+        """Return the initial state, all zeros.
 
-        At the first call the first frame stands for all frames before it.
+        In the first call, the first frame replaces all earlier frames.
 
         Args:
             batch: must be 1. Without a batch axis, windows (T, size) are exported to fewer operations.
@@ -284,12 +286,12 @@ class StreamingGraph(nn.Module):
         return {name: tensor.to(self.normalizer.mean) for name, tensor in state.items() if tensor.numel()}
 
     def advance(self, sparse: Tensor, state: State, newest: int = 1) -> tuple[Tensor, State]:
-        """Take in one frame.
+        """Process one frame.
 
         Args:
             sparse: world inputs (1, 1, 54).
-            state: what the last call returned, or `initial_state`.
-            newest: must be 1, since no other frame is computed.
+            state: the state from the last call, or `initial_state`.
+            newest: must be 1, because only the newest frame is computed.
 
         Returns:
             Motion (1, 1, 198) in the world, and the new state.
@@ -302,12 +304,12 @@ class StreamingGraph(nn.Module):
         return motion[None], {name: tensor for name, tensor in kept.items() if tensor.numel()}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Take in one frame.
+        """Process one frame.
 
         Args:
             sparse: world inputs (1, 54).
-            state: the state, all zeros at a fresh start.
-            fresh: 1 at a fresh start and 0 after it (1,).
+            state: the state, initially zeros.
+            fresh: 1 in a stream's first step, else 0 (1,).
 
         Returns:
             World motion (1, 198), and the new state.
@@ -316,7 +318,7 @@ class StreamingGraph(nn.Module):
 
 
 class FrameGraph(StreamingGraph):
-    """The streaming graph of a network without a window: the network itself, one frame per step."""
+    """The streaming graph of a network without a window, which runs the network one frame per step."""
 
     model: WindowlessModel
 
@@ -324,7 +326,7 @@ class FrameGraph(StreamingGraph):
         self.model = model
 
     def windows(self) -> State:
-        """Return the network's state at a fresh start, which is all that it carries: it has no window."""
+        """Return the network's initial state, because it does not have a window."""
         return self.model.initial_state(1)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:

@@ -18,7 +18,7 @@ from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import FeatureMemory, FeatureMemorySettings, Past, Recall, RecurrentPast
 from memmlp.networks.motion_model import State
-from memmlp.networks.vqvae import VQVAE, straight_through
+from memmlp.networks.vqvae import VQVAE, pass_gradients_through
 
 
 class Projection(nn.Module):
@@ -40,11 +40,11 @@ class Projection(nn.Module):
 
 
 class Blend(nn.Module):
-    """The coefficient m (reading 7), drawn from U[0, 1] per frame and channel in training.
+    """The coefficient m (docs/readings.md, no. 7), in training drawn from U[0, 1] per frame and channel.
 
     Args:
-        value: m at inference, in [0, 1], or "sampled" to draw it at inference too. An exported ONNX file has
-            the mean of such draws instead.
+        value: m at inference, in [0, 1], or "sampled" to draw it also at inference. An exported ONNX file
+            uses their mean, 0.5.
     """
 
     MEAN = 0.5
@@ -54,8 +54,8 @@ class Blend(nn.Module):
         self.value = value
 
     @property
-    def sampled(self) -> bool:
-        """Whether m is drawn at inference too."""
+    def is_sampled(self) -> bool:
+        """Whether m is also drawn at inference."""
         return isinstance(self.value, str)
 
     def forward(self, like: Tensor) -> Tensor | float:
@@ -70,7 +70,7 @@ class PastFeature(nn.Module):
 
     Args:
         width: k, the width of the feature.
-        code_width: width of a code-vector; None for the feature without Z_E and the VQ-VAE (Table 11).
+        code_width: width of a code-vector; None for a feature without Z_E and VQ-VAE (Table 11).
         blend: the coefficient m.
     """
 
@@ -89,11 +89,11 @@ class PastFeature(nn.Module):
         return z if self.codes is None else z + (1 - m) * self.codes(past.codes)
 
 
-class JointProjections(nn.Module):
-    """The projections that several memory blocks make of the same input, computed at once.
+class MergedProjections(nn.Module):
+    """Several memory blocks' projections of the same input, computed at once.
 
     Args:
-        parts: the blocks' projections, all of the same shape.
+        parts: the blocks' projections, which have the same shape.
     """
 
     def __init__(self, parts: Sequence[Projection]):
@@ -120,7 +120,7 @@ class CodeTable(nn.Module):
 
     def __init__(self, parts: Sequence[Projection], vectors: Tensor):
         super().__init__()
-        self.projected = nn.Parameter(JointProjections(parts)(vectors).detach())
+        self.projected = nn.Parameter(MergedProjections(parts)(vectors).detach())
 
     def forward(self, index: Tensor) -> Tensor:
         """Map the index (1,) of a code-vector to its projections (1, blocks, k)."""
@@ -128,28 +128,28 @@ class CodeTable(nn.Module):
 
 
 class CodeIndices(nn.Module):
-    """A stand-in for a VQ-VAE that gives the index of a frame's code-vector instead of the vector."""
+    """A replacement for a VQ-VAE that returns a code-vector's index instead of the vector."""
 
     def __init__(self, codes: VQVAE):
         super().__init__()
         self.encoder, self.codebook = codes.encoder, codes.codebook
 
-    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+    def compute_code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return the index (1, 1) for a frame's inputs (1, 1, 54) and motion (1, 1, 198)."""
         return self.codebook.find_indices(self.encoder(torch.cat([sparse[0], motion[0]], -1)))[None]
 
 
 class OwnPastRecall(Recall):
-    """Recall for memories of the network's own past, whose blocks' projections are computed together."""
+    """Recall for memories of the network's own past; it computes all blocks' projections together."""
 
-    def join(self, features: Sequence[PastFeature]) -> None:
-        """Make one feature module whose projections are those of all blocks; code-vectors get a table."""
+    def merge_features(self, features: Sequence[PastFeature]) -> None:
+        """Make one feature module with the projections of all blocks; code-vectors use a table."""
         self.whole = copy.deepcopy(features[0])
         for name, child in list(self.whole.named_children()):
             if isinstance(child, Projection):
                 parts = [getattr(feature, name) for feature in features]
                 table = (
-                    CodeTable(parts, self._replace_codes()) if name == "codes" else JointProjections(parts)
+                    CodeTable(parts, self._replace_codes()) if name == "codes" else MergedProjections(parts)
                 )
                 setattr(self.whole, name, table)
 
@@ -170,8 +170,8 @@ class OwnPastMemorySettings(FeatureMemorySettings):
     """The keys of the memories of the network's own past.
 
     Attributes:
-        codes: "frozen" if the memory needs a VQ-VAE that is trained before, "joint" if its VQ-VAE is trained
-            with the network, "" without a VQ-VAE.
+        codes: "frozen" for a VQ-VAE trained before the network, "joint" for a VQ-VAE trained with the
+            network, "" without a VQ-VAE.
     """
 
     # window: the past window ends T frames ago; frame: it ends one frame ago (reading 6)
@@ -201,19 +201,18 @@ class CodeMemorySettings(OwnPastMemorySettings):
 @component("memory", "vq_joint", builds="JointCodeMemory")
 @dataclass
 class JointCodeMemorySettings(OwnPastMemorySettings):
-    """As vq, but the VQ-VAE is trained from scratch with the network (App. A), by a loss without a weight.
+    """Like vq, but the VQ-VAE is trained from scratch with the network (App. A), by an unweighted loss.
 
-    The VQ-VAE has no stage of its own, so that vqvae.steps, epochs, batch, lr and weight_decay have no
-    effect.
+    The VQ-VAE does not have its own run, so vqvae.steps, epochs, batch, lr and weight_decay have no effect.
     """
 
     codes: ClassVar[str] = "joint"
 
 
 class OwnPastMemory(FeatureMemory):
-    """A memory of the network's own past; the base of those with and without code-vectors.
+    """The base class of memories of the network's own past, with and without code-vectors.
 
-    `memory.blend.value` changes m in a trained network.
+    Set `memory.blend.value` to change m in a trained network.
 
     Args:
         settings: the memory's keys.
@@ -230,7 +229,7 @@ class OwnPastMemory(FeatureMemory):
         self.past_frames = self.frames + self.shift - 1
 
     def initial_state(self, batch: int) -> State:
-        """Return zeros as the past motion, the paper's fallback where there is no previous prediction."""
+        """Return zeros as the past motion, the paper's fallback without previous predictions."""
         return {"motion": torch.zeros(batch, self.past_frames, MOTION_DIM)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
@@ -243,16 +242,15 @@ class OwnPastMemory(FeatureMemory):
     def recall(self, sparse: Tensor, state: State, new: int) -> Past:
         """Recall the T frames that end one shift before the newest frame; see Memory.
 
-        If that window would reach into the new frames, it ends just before the first of them instead.
-        """
+        If necessary, the frames end earlier, just before the first new frame."""
         # The buffers begin T + shift - 1 frames before the first new one, so the window begins at new - 1,
         # but not after shift - 1: the motion of the new frames is not known yet.
         start = min(new, self.shift) - 1
         view = slice(start, start + self.frames)
         sparse, motion = sparse[:, view], state["motion"][:, view]
-        return Past(sparse, motion, self.code_vectors(sparse, motion))
+        return Past(sparse, motion, self.compute_code_vectors(sparse, motion))
 
-    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+    def compute_code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198)."""
         raise NotImplementedError
 
@@ -269,7 +267,7 @@ class NoCodesMemory(OwnPastMemory):
     def make_feature(self) -> nn.Module:
         return PastFeature(self.width, None, self.blend)
 
-    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+    def compute_code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return code-vectors of width 0, (B, T, 0), since this memory uses no code-vectors."""
         return sparse[..., :0]
 
@@ -277,7 +275,7 @@ class NoCodesMemory(OwnPastMemory):
 class VQMemory(OwnPastMemory):
     """A memory of the network's own past with code-vectors (Sec. 3.2.1), from any kind of VQ-VAE.
 
-    Each frame of the past window has one code-vector, shared by all memory blocks (reading 4).
+    Each frame of the past window has one code-vector for all memory blocks (docs/readings.md, no. 4).
     """
 
     codes: VQVAE
@@ -285,12 +283,12 @@ class VQMemory(OwnPastMemory):
     def make_feature(self) -> nn.Module:
         return PastFeature(self.width, self.codes.width, self.blend)
 
-    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        return self.codes.code_vectors(sparse, motion)
+    def compute_code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+        return self.codes.compute_code_vectors(sparse, motion)
 
 
 class CodeMemory(VQMemory):
-    """The paper's memory, whose VQ-VAE is trained beforehand and frozen."""
+    """The paper's memory, with a frozen VQ-VAE that was trained before."""
 
     def __init__(self, settings: CodeMemorySettings, *, codes: VQVAE | None = None, **sizes: Any):
         super().__init__(settings, **sizes)
@@ -298,18 +296,18 @@ class CodeMemory(VQMemory):
         self.codes = codes.requires_grad_(False)
 
     def train(self, mode: bool = True) -> CodeMemory:
-        """Set the training mode of everything but the VQ-VAE, which stays in evaluation mode."""
+        """Set the training mode; the VQ-VAE always stays in evaluation mode."""
         super().train(mode)
         self.codes.eval()
         return self
 
 
 class JointCodeMemory(VQMemory):
-    """A memory whose VQ-VAE is trained from scratch with the network (App. A: worse than the frozen one).
+    """A memory with a VQ-VAE that is trained with the network (App. A: worse than a frozen VQ-VAE).
 
-    The VQ-VAE's loss, on the true frames of the window, is added with weight 1: it is not one of Eq. 5's
-    terms, and an uncertainty weight on a codebook loss that goes to zero would grow without bound. The
-    network's own loss reaches the encoder by the straight-through gradient of the code-vectors.
+    The VQ-VAE's loss on the window's true frames is added with weight 1. It is not a term of Eq. 5, and an
+    uncertainty weight would grow without bound, since the codebook loss goes to zero. The network's loss
+    reaches the encoder through the code-vectors' straight-through gradient.
 
     Args:
         settings: the memory's keys.
@@ -321,18 +319,18 @@ class JointCodeMemory(VQMemory):
         super().__init__(settings, **sizes)
         self.codes = vqvae()
 
-    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+    def compute_code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198).
 
-        In training they have the straight-through gradient.
+        In training the code-vectors have the straight-through gradient.
         """
         if not self.training:
-            return super().code_vectors(sparse, motion)
+            return super().compute_code_vectors(sparse, motion)
         latent = self.codes.encode(torch.cat([sparse, motion], -1))
-        return straight_through(latent, self.codes.codebook(latent)[0])
+        return pass_gradients_through(latent, self.codes.codebook(latent)[0])
 
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
-        """Return the VQ-VAE's losses on true world frames: Eq. 1 of its reconstruction, and the codebook's.
+        """Return the VQ-VAE's losses on true world frames: the rotation error (Eq. 1) and the codebook loss.
 
         An EMA codebook learns from this call.
         """

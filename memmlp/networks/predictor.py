@@ -27,8 +27,7 @@ class Branch(nn.Module):
         depth: number of blocks.
         hidden: the backbone's d.
         frames: the backbone's T.
-        memory_block: makes the blocks, which see memory features like those of the backbone (Table 8); None
-            for MLP blocks.
+        memory_block: makes memory blocks like the backbone's (Table 8); None for MLP blocks.
     """
 
     def __init__(self, size: int, depth: int, hidden: int, frames: int, memory_block: MakeBlock | None):
@@ -38,18 +37,18 @@ class Branch(nn.Module):
         self.linear = nn.Linear(hidden, size)
 
     def forward(self, h: Tensor, past: object, newest: int) -> Tensor:
-        """Map the hidden state (B, T, d) and the recalled past to the newest frames' (B, newest, size)."""
+        """Map the hidden state (B, T, d) and the recalled past to outputs (B, newest, size)."""
         for block in self.blocks[:-1]:
             h = block(h, past)
         for last in self.blocks[-1:]:
-            h = last.newest(h, newest) if isinstance(last, MLPBlock) else last(h, past)
+            h = last.compute_newest(h, newest) if isinstance(last, MLPBlock) else last(h, past)
         return self.linear(h[..., -newest:, :])
 
 
 @component("predictor", "two_branch", builds="TwoBranch")
 @dataclass
 class TwoBranchSettings(Settings):
-    """Rotations and positions, with a branch for each (Sec. 3.2.2)."""
+    """A branch for rotations and a branch for positions (Sec. 3.2.2)."""
 
     depth: int = setting(at_least(0), 2)  # MLP blocks in each branch (Sec. 4.1)
 
@@ -60,7 +59,7 @@ class TwoBranchSettings(Settings):
 @component("predictor", "two_branch_memory", builds="TwoBranch")
 @dataclass
 class TwoBranchMemorySettings(TwoBranchSettings):
-    """Rotations and positions, with a branch of memory blocks for each (Table 8, "MHP w/ MB").
+    """Like two_branch, but with memory blocks in both branches (Table 8, "MHP w/ MB").
 
     It needs a memory.
     """
@@ -73,7 +72,10 @@ class TwoBranchMemorySettings(TwoBranchSettings):
 @component("predictor", "rotation_only", builds="RotationOnly")
 @dataclass
 class RotationOnlySettings(TwoBranchSettings):
-    """Rotations alone (Table 4); positions follow by forward kinematics. It needs hand=fk or hand=off."""
+    """Only a rotation branch (Table 4). Positions follow by forward kinematics.
+
+    It needs hand=fk or hand=off.
+    """
 
     positions: ClassVar[bool] = False
 
@@ -81,23 +83,23 @@ class RotationOnlySettings(TwoBranchSettings):
 @component("predictor", "rotation_only_memory", builds="RotationOnly")
 @dataclass
 class RotationOnlyMemorySettings(TwoBranchMemorySettings):
-    """Rotations alone, by a branch of memory blocks. It needs a memory, and hand=fk or hand=off."""
+    """Only a rotation branch, of memory blocks. It needs a memory, and hand=fk or hand=off."""
 
     positions: ClassVar[bool] = False
 
 
 class Predictor(nn.Module):
-    """A branch for the rotations, and one for the positions where `branches` has them.
+    """A predictor with a rotation branch, and a position branch if `branches` includes "position".
 
     Args:
-        settings: the predictor's keys, and whether its branches consist of memory blocks.
+        settings: the predictor's settings.
         hidden: the backbone's d.
         frames: the backbone's T.
         memory_block: makes a memory block.
 
     Attributes:
-        branches: the parts of the motion that have a branch, "rotation" and perhaps "position". Without the
-            latter, positions follow by forward kinematics, without gradients.
+        branches: the quantities with a branch: "rotation", and optionally "position". Without a position
+            branch, positions follow by forward kinematics, without gradients.
     """
 
     branches: ClassVar[frozenset[str]] = frozenset({"rotation", "position"})
@@ -116,10 +118,10 @@ class Predictor(nn.Module):
 
         Args:
             h: hidden state (B, T, d).
-            past: what the memory recalls.
-            sparse: world inputs (B, T, 54), whose head position says where the body is.
+            past: the memory's recalled past.
+            sparse: world inputs (B, T, 54); the head position places the body.
             normalizer: converts between the world and network space.
-            newest: how many of the newest frames are wanted.
+            newest: number of newest frames to predict.
 
         Returns:
             Motion (B, newest, 198) in network space.
@@ -134,10 +136,10 @@ class Predictor(nn.Module):
 
 
 class TwoBranch(Predictor):
-    """One branch for the rotations and one for the positions."""
+    """A predictor with a rotation branch and a position branch."""
 
 
 class RotationOnly(Predictor):
-    """One branch for the rotations."""
+    """A predictor with only a rotation branch."""
 
     branches = frozenset({"rotation"})

@@ -1,4 +1,4 @@
-"""RecurrentPoser, this project's own network: a recurrent stream of poses, without a window."""
+"""RecurrentPoser, this project's network: a recurrent stream of poses, without a window."""
 
 from __future__ import annotations
 
@@ -15,26 +15,27 @@ from memmlp.common.settings import at_least, one_of, setting, sized
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer, in_float32
-from memmlp.networks.layers import compute_products, step_gru
-from memmlp.networks.limb_solver import reach_hands, use_tracker_rotations
+from memmlp.networks.layers import compute_gate_products, step_gru
+from memmlp.networks.limb_solver import bend_arms_to_trackers, use_tracker_rotations
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import OneFrameNormalizer
 
 SHORTEST, LONGEST = 0.9, 0.999
-"""The least share of its state that a fresh LRU's first and last unit keep from frame to frame."""
+"""The smallest fraction of its state that an untrained LRU's first and last unit keep from frame to frame."""
 
 
 class RecurrentCell(nn.Module):
-    """A recurrent layer of d inputs and d outputs; the interface of all of them.
+    """The interface of recurrent cells, which have d inputs and d outputs.
 
-    `forward` takes in a whole sequence, as in training, and `step` one frame, as live; they compute the same.
+    `forward` processes a sequence, for training. `step` processes one frame, for live use. Both give equal
+    results.
 
     Args:
         width: d.
 
     Attributes:
-        carried: how many numbers each of the d units carries from frame to frame.
+        carried: number of values that each of the d units carries from frame to frame.
     """
 
     carried: ClassVar[int] = 1
@@ -51,7 +52,7 @@ class RecurrentCell(nn.Module):
         raise NotImplementedError
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one input (B, d) at a state; return the output (B, d) and the state after it."""
+        """Process one input (B, d) with a state; return the output (B, d) and the new state."""
         raise NotImplementedError
 
 
@@ -72,7 +73,7 @@ class GRUCell(RecurrentCell):
 
 
 class LSTMCell(RecurrentCell):
-    """A long short-term memory (Hochreiter & Schmidhuber 1997); its state is hidden state, then cell."""
+    """A long short-term memory (Hochreiter & Schmidhuber 1997) with the state [hidden, cell]."""
 
     carried = 2
 
@@ -87,21 +88,21 @@ class LSTMCell(RecurrentCell):
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         hidden, cell = state.chunk(2, -1)
-        entering, again = compute_products(self.layer.all_weights[0], x, hidden)
+        entering, again = compute_gate_products(self.layer.all_weights[0], x, hidden)
         enter, keep, new, show = (entering + again).chunk(4, -1)
         cell = torch.sigmoid(keep) * cell + torch.sigmoid(enter) * torch.tanh(new)
         hidden = torch.sigmoid(show) * torch.tanh(cell)
         return hidden, torch.cat([hidden, cell], -1)
 
 
-def scan(keep: Tensor, new: Tensor, state: Tensor) -> Tensor:
-    """Return h_t = keep_t h_(t-1) + new_t for all frames, in log2(n) passes over all of them.
+def scan_linear_recurrence(keep: Tensor, new: Tensor, state: Tensor) -> Tensor:
+    """Return h_t = keep_t h_(t-1) + new_t for all frames, computed in log2(n) passes.
 
-    Each pass doubles the number of past frames that a frame's h holds (Hillis & Steele 1986).
+    Each pass doubles the number of past frames in h (Hillis & Steele 1986).
 
     Args:
-        keep: the share of each unit's state that is kept (B, n, d).
-        new: what is added to it (B, n, d).
+        keep: the fraction of each unit's state that is kept (B, n, d).
+        new: the values added to the kept state (B, n, d).
         state: h before the first frame (B, d).
 
     Returns:
@@ -117,30 +118,30 @@ def scan(keep: Tensor, new: Tensor, state: Tensor) -> Tensor:
 
 
 class LinearCell(RecurrentCell):
-    """The base of cells whose units are linear in their own state, so that all frames are made at once."""
+    """The base class of cells that are linear in their state; training computes all frames at once."""
 
-    def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map inputs (..., d) to the share of the state that is kept and to what is added, both (..., d)."""
+    def compute_gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Map inputs (..., d) to the kept fraction of the state and to the added values, both (..., d)."""
         raise NotImplementedError
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        h = scan(*self.gates(x), state)
+        h = scan_linear_recurrence(*self.compute_gates(x), state)
         return h, h[:, -1]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        keep, new = self.gates(x)
+        keep, new = self.compute_gates(x)
         state = keep * state + new
         return state, state
 
 
 class MinGRU(LinearCell):
-    """A GRU whose gate and candidate see the input alone (Feng et al. 2024)."""
+    """A minimal GRU: gate and candidate depend only on the input (Feng et al. 2024)."""
 
     def __init__(self, width: int):
         super().__init__(width)
         self.linear = nn.Linear(width, 2 * width)
 
-    def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def compute_gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
         gate, new = self.linear(x).chunk(2, -1)
         update = torch.sigmoid(gate)
         return 1 - update, update * new
@@ -155,7 +156,7 @@ class LRU(LinearCell):
         rate = -torch.linspace(SHORTEST, LONGEST, width).log()
         self.decay = nn.Parameter(rate.expm1().log())  # softplus makes the rate of it
 
-    def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def compute_gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
         forget, enter, new = self.linear(x).chunk(3, -1)
         keep = torch.exp(-F.softplus(self.decay) * torch.sigmoid(forget))
         room = (1 - keep.square()).clamp_min(1e-6).sqrt()  # keeps the state's variance that of its inputs
@@ -163,7 +164,7 @@ class LRU(LinearCell):
 
 
 CELLS: dict[str, type[RecurrentCell]] = {"gru": GRUCell, "lstm": LSTMCell, "mingru": MinGRU, "lru": LRU}
-"""The cells by the names that the config knows."""
+"""The cells by their names in the config."""
 
 
 class RecurrentBlock(nn.Module):
@@ -184,7 +185,7 @@ class RecurrentBlock(nn.Module):
         )
 
     def forward(self, h: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Map a sequence (B, n, d), or one frame (B, d), and the cell's state to the same and a new state."""
+        """Map a sequence (B, n, d) or frame (B, d) to the same shape; return it and the new state."""
         x = self.cell_norm(h)
         if h.dim() == 2:
             made, state = self.cell.step(x, state)
@@ -195,8 +196,8 @@ class RecurrentBlock(nn.Module):
         return h + self.mlp(self.norm(h)), state
 
 
-class Member(nn.Module):
-    """From encoded inputs to rotations: a linear stem, residual blocks, and a linear head.
+class EnsembleMember(nn.Module):
+    """A network of the ensemble: linear stem, residual blocks and linear head, from inputs to rotations.
 
     Args:
         settings: width, depth, cell and expansion of the blocks.
@@ -216,9 +217,9 @@ class Member(nn.Module):
         self.head = nn.Linear(width, ROTATION.stop)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Map encoded inputs (B, n, 54) or (B, 54) to rotations (..., 132) and the state after them.
+        """Map encoded inputs (B, n, 54) or (B, 54) to rotations (..., 132) and the new state.
 
-        The state (B, carried x d) of each block's cell is named by the block.
+        The state of each block's cell (B, carried x d) has the block's name.
         """
         h, kept = self.stem(x), {}
         for name, block in self.blocks.items():
@@ -229,7 +230,7 @@ class Member(nn.Module):
 def compute_mean_pose(normalizer: Normalizer) -> Tensor:
     """Return the global rotations (132,), 6D, of the mean pose in the network's coordinates.
 
-    They are zeros where the normalizer has no mean (`normalizer.z_scores=false`).
+    They are zeros without z-scores (`normalizer.z_scores=false`).
     """
     local = sixd_to_matrix(normalizer.mean[SPARSE_DIM:][ROTATION].unflatten(-1, (N_JOINTS, 6)))
     rotations, _ = forward_kinematics(local, torch.zeros_like(normalizer.rest[0]), normalizer.rest)
@@ -237,10 +238,10 @@ def compute_mean_pose(normalizer: Normalizer) -> Tensor:
 
 
 class RecurrentPoserGraph(FrameGraph):
-    """RecurrentPoser's streaming graph: the network itself, with cells written as plain layers for one frame.
+    """RecurrentPoser's streaming graph: the network, with plain layers as cells for one frame.
 
-    When the graph is quantised, only the cells become int8: a state averages the rounding errors of many
-    frames, whereas the MLPs would pass them on to the motion, where they show as jitter.
+    When the graph is quantised, only the cells become int8. A cell's state averages rounding errors over many
+    frames, but rounding in the MLPs would show as jitter.
     """
 
     model: RecurrentPoser
@@ -266,7 +267,7 @@ class RecurrentPoserSettings(NetworkSettings):
 
     It is a recurrent stream without a window. It predicts rotations; positions follow by forward kinematics,
     with the head on its tracker. The learning rate is the best of four at profile=small. Weight decays from
-    0.05 to 0.5 are alike in MPJRE, and Jitter falls with them (docs/guides/recurrent-poser.md).
+    0.05 to 0.5 give similar MPJRE; higher ones reduce Jitter (docs/guides/recurrent-poser.md).
     """
 
     # T, the frames of a training window, from a zero state; live there is no window
@@ -302,16 +303,16 @@ class RecurrentPoserSettings(NetworkSettings):
             config["model"]["output"] == "reaching" and config["refiner"] is None
         )  # a refiner moves arms again
         if config["evaluation"]["ik"] == "arms" and reaching:
-            yield "evaluation.ik=arms: must be off, since the arms of model.output=reaching reach already"
+            yield "evaluation.ik=arms: must be off, since model.output=reaching already moves the arms"
 
 
 class RecurrentPoser(WindowlessModel):
-    """A recurrent stream of rotations, averaged over several members.
+    """RecurrentPoser: an ensemble of recurrent networks with averaged rotations.
 
-    Each member learns by itself: in training, losses are computed on the motion of each member. The positions
-    follow from the rotations by forward kinematics, the head on its tracker. All it knows of the past is the
-    state of its cells; it does not see its own outputs. Training unrolls it over T frames from a zero state,
-    as a live stream starts.
+    The ensemble's networks (members) are trained separately: each has losses on its own motion. Positions
+    follow from the rotations by forward kinematics with the head on its tracker. The cells' states are its
+    only information about the past; it does not see its own outputs. Training runs over T frames from a zero
+    state, like the start of a live stream.
     """
 
     graph = RecurrentPoserGraph
@@ -320,24 +321,24 @@ class RecurrentPoser(WindowlessModel):
         super().__init__(normalizer, settings.frames)
         self.output = settings.output
         members = range(1, settings.members + 1)
-        self.members = nn.ModuleDict({f"member{i}": Member(settings) for i in members})
+        self.members = nn.ModuleDict({f"member{i}": EnsembleMember(settings) for i in members})
         size = CELLS[settings.cell].carried * settings.width
         self.sizes = {f"member{i}_block{j}": size for i in members for j in range(1, settings.depth + 1)}
         if self.output != "local":
             # Trainings that begin at random rotations, far from the mean pose, leave legs turned wrongly.
-            for member in cast(Iterable[Member], self.members.values()):
+            for member in cast(Iterable[EnsembleMember], self.members.values()):
                 member.head.weight.data *= 0.3
                 member.head.bias.data.copy_(compute_mean_pose(normalizer))
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start: zeros (B, size) for each cell, named by its member and block."""
+        """Return the initial state: zeros (B, size) for each cell, by names of member and block."""
         return {name: self.normalizer.mean.new_zeros(batch, size) for name, size in self.sizes.items()}
 
     def pose(self, made: Tensor, sparse: Tensor, reach: bool = True) -> Tensor:
         """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54).
 
-        With `model.output=reaching` the arms reach to the hands' trackers (`reach_hands`), if `reach`.
-        Global rotations inherit no errors from a joint's ancestors; positions are sums of turned bones.
+        With `model.output=reaching` the arms reach to the hands' trackers if `reach` is set. Global rotations
+        do not inherit errors from a joint's ancestors. Positions are sums of rotated bones.
         """
         if self.output == "local":
             return self.normalizer.posed(made, sparse)
@@ -346,13 +347,13 @@ class RecurrentPoser(WindowlessModel):
             if not (reach and self.output == "reaching"):
                 return self.normalizer.posed_in_world(rotations, sparse)
             rotations = use_tracker_rotations(rotations, sparse)
-            return self.normalizer.posed_in_world(rotations, sparse, reach_hands)
+            return self.normalizer.posed_in_world(rotations, sparse, bend_arms_to_trackers)
 
     def predict_members(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
-        """Return the rotations of each member (members, ..., 132), and the state after them.
+        """Return the rotations of each member (members, ..., 132), and the new state.
 
         Args:
-            sparse: world inputs (B, n, 54), or (B, 54) of one frame, which has plain layers then.
+            sparse: world inputs (B, n, 54), or (B, 54) for one frame, which uses plain layers.
             state: the state before these frames.
         """
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
@@ -371,10 +372,10 @@ class RecurrentPoser(WindowlessModel):
         return self.pose(made[:, :, start:].mean(0), sparse[:, start:]), kept
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call; it returns the motion of each member (members B, T, 198), one by one.
+        """Return each member's motion, one after the other (members x B, T, 198); see MotionModel.
 
-        The losses compare the arms before they reach: with losses after it, rotations and positions had
-        larger errors.
+        The arms do not reach for the trackers here. Losses after reaching gave larger errors of rotations and
+        positions.
         """
         made, kept = self.predict_members(sparse, state)
         motion = self.pose(made, sparse.expand(len(made), -1, -1, -1), reach=False)

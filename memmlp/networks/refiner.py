@@ -1,8 +1,7 @@
 """The refiner slot: a refiner corrects the stream of a network's poses, frame by frame.
 
-SAGE-Net's refiner (Feng et al., CVPR 2024) is a recurrent network behind its decoder; here it may stand
-behind any network. It is trained on the poses that the finished network streams
-(memmlp.training.train_refiner).
+SAGE-Net's refiner (Feng et al., CVPR 2024) is a recurrent network behind its decoder. Here it can follow any
+network. It is trained on the poses that the trained network streams (memmlp.training.train_refiner).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from memmlp.common.settings import Settings, at_least, one_of, positive, setting
 from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer, in_float32
 from memmlp.networks.motion_model import MotionModel, State, StreamingGraph
-from memmlp.networks.streaming import FrameGRU, has_stream, streaming
+from memmlp.networks.streaming import FrameGRU, has_streaming_graph, streaming
 
 HIDDEN = "refiner"  # the name of the refiner's own state
 
@@ -28,9 +27,9 @@ HIDDEN = "refiner"  # the name of the refiner's own state
 class SAGERefinerSettings(Settings):
     """SAGE-Net's refiner (Feng et al. 2024): recurrent layers that correct a stream of rotations.
 
-    It is trained behind the finished network, whose run is the same as without it, on poses that the network
-    streams; its loss is its released code's. Arms that reach to the hands' trackers are corrected,
-    too; evaluation.ik=arms makes them reach again. Steps, batch (of pieces) and schedule are those of optim.
+    It is trained on poses that the trained network streams; the network's run is shared with experiments
+    without a refiner. The loss follows the released code. The refiner may move arms off the hands' trackers;
+    evaluation.ik=arms moves them back. Steps, batch (in pieces) and schedule come from optim.
     """
 
     width: int = setting(at_least(1), tiny=8, small=96, paper=512)  # the width of the recurrent layers
@@ -42,20 +41,20 @@ class SAGERefinerSettings(Settings):
     velocities: str = setting(one_of("rotations", "joints"), "rotations")  # whose movement its loss compares
     lr: float | None = setting(positive(), None)  # learning rate at the start; null: that of optim
 
-    def build(self, network: MotionModel) -> Refined:
-        """Put a refiner with fresh weights behind a network."""
-        return Refined(network, self.width, self.depth)
+    def build(self, network: MotionModel) -> RefinedModel:
+        """Add a refiner with random weights behind a network."""
+        return RefinedModel(network, self.width, self.depth)
 
 
 class RefinedGraph(StreamingGraph):
-    """The network's own streaming graph, followed by a step of the refiner's recurrent layers."""
+    """The network's streaming graph, followed by a step of the refiner's recurrent layers."""
 
-    model: Refined
+    model: RefinedModel
 
     @classmethod
     def fits(cls, model: Any) -> bool:
         """Return whether the network in front of the refiner has a streaming graph."""
-        return has_stream(model.network)
+        return has_streaming_graph(model.network)
 
     def build(self, model: Any) -> None:
         """Make the network's streaming graph and keep a copy of the refiner."""
@@ -66,7 +65,7 @@ class RefinedGraph(StreamingGraph):
         self.float32_modules = (*inner, "model.layers", "model.head")
 
     def windows(self) -> State:
-        """Return zeros: the state that the network's graph carries, and the hidden one (1, depth, width)."""
+        """Return zeros for the state of the network's graph, and for the hidden state (1, depth, width)."""
         return {**self.graph.windows(), HIDDEN: self.hidden}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
@@ -75,13 +74,12 @@ class RefinedGraph(StreamingGraph):
         return refined[0], {**kept, HIDDEN: hidden}
 
 
-class Refined(MotionModel):
+class RefinedModel(MotionModel):
     """A network followed by recurrent layers that correct its rotations; a stream in both evaluation modes.
 
     With 2 layers of width 512 the refiner has 2,635,908 parameters. Rotations are corrected in the world.
-    Learned positions stay as they are; others follow from the corrected rotations. Hands that the network
-    itself put on their trackers (RecurrentPoser, MANIKIN) do not stay there; `evaluation.ik=arms` brings them
-    back.
+    Learned positions stay unchanged; other positions follow from the corrected rotations. Networks that put
+    hands on their trackers (RecurrentPoser, MANIKIN) lose this; `evaluation.ik=arms` restores it.
 
     Args:
         network: the network; it is not trained further.
@@ -105,17 +103,17 @@ class Refined(MotionModel):
         return self.network.normalizer
 
     def count_parameters(self) -> int:
-        """Return how many parameters the network uses, including those of the refiner."""
+        """Return the number of parameters of network and refiner."""
         own = (p.numel() for part in (self.layers, self.head) for p in part.parameters())
         return self.network.count_parameters() + sum(own)
 
     @property
     def past_frames(self) -> int:
-        """How many past frames of inputs the network's buffer holds."""
+        """The number of past input frames in the network's buffer."""
         return self.network.past_frames
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start, zeros: the network's, and the hidden one (B, depth, width)."""
+        """Return the initial state, zeros: the network's state, and the hidden state (B, depth, width)."""
         hidden = torch.zeros(batch, self.layers.num_layers, self.layers.hidden_size)
         return {**self.network.initial_state(batch), HIDDEN: hidden.to(self.normalizer.mean)}
 
@@ -123,13 +121,13 @@ class Refined(MotionModel):
         return self.initial_state(len(sparse)) | self.network.running_state(sparse)
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after world frames (B, past, 252), without any corrections yet."""
+        """Return the state after world frames (B, past, 252), without earlier corrections."""
         return self.initial_state(len(frames)) | self.network.true_state(frames)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames, one after the other; see MotionModel.
+        """Process the newest frames one after the other; see MotionModel.
 
-        By default the n new frames are returned, which are the most that this network can make.
+        By default the n new frames are returned, which is the maximum for this network.
         """
         made, kept = [], {name: tensor for name, tensor in state.items() if name != HIDDEN}
         for frame in sparse.split(1, 1):
@@ -148,7 +146,7 @@ class Refined(MotionModel):
             hidden: hidden states (B, depth, width) before these frames.
 
         Returns:
-            Motion (B, n, 198), and the hidden states after it.
+            Motion (B, n, 198), and the new hidden states.
         """
         rotation = motion[..., ROTATION]
         with in_float32(motion.device):

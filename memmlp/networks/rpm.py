@@ -1,6 +1,6 @@
 """RPM (Rolling Prediction Model, CVPR 2025): each step predicts the next frames again.
 
-The nearer a predicted frame is, the less a new prediction may change it; the nearest one is shown.
+A new prediction may change near frames less than far frames. The nearest frame is shown.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, Win
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.transformer import Attention, make_encoder
 
-FRESH = 0.25  # of the training windows begin as a live stream does, without a past
+FRESH_FRACTION = 0.25  # of the training windows begin as a live stream does, without a past
 
 
 class RPMGraph(FrameGraph):
@@ -36,10 +36,10 @@ class RPMGraph(FrameGraph):
 @component("model", "rpm", builds="RPM")
 @dataclass
 class RPMSettings(NetworkSettings):
-    """RPM (CVPR 2025): a stream that predicts the next frames at every step, and refines them later.
+    """RPM (CVPR 2025): a stream that predicts the next frames at every step, and refines them in later steps.
 
-    Loss and features are its released code's, except that its inputs are z-scores, too; hands are always
-    visible. Training is this project's: AdamW with its schedule.
+    Loss and features follow its released code, but inputs are z-scores, and hands are always visible.
+    Training uses AdamW with the profile's schedule.
     """
 
     # T, the frames of a training window: context, up to T - context - horizon of free running, horizon
@@ -71,12 +71,12 @@ class RPMSettings(NetworkSettings):
 
 
 class RPM(WindowlessModel):
-    """Cross-attention from past and future motion to the newest inputs, then encoder layers.
+    """RPM: cross-attention from past and future motion to the newest inputs, then encoder layers.
 
-    It has 9,626,756 parameters at the paper's sizes; the released code has a further layer of 262,656 that
-    nothing uses (9,889,412). Readings: a frame that is predicted for the first time takes the prediction
-    unchanged; a live stream begins with zeros as its past motion, as a quarter of the training windows do,
-    and with its first frame's inputs in place of earlier ones.
+    It has 9,626,756 parameters at the paper's sizes; the released code has an additional unused layer of
+    262,656 (9,889,412). Our readings: the first prediction of a frame is used unchanged. A live stream begins
+    with zeros as past motion, like a quarter of the training windows. Its first frame's inputs replace
+    earlier inputs.
     """
 
     graph = RPMGraph
@@ -104,7 +104,7 @@ class RPM(WindowlessModel):
         self.register_buffer("freedom", freedom, persistent=False)
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start, zeros.
+        """Return the initial state, zeros.
 
         `started` and `predicted` are 1 as soon as `sparse` and `prediction` hold frames.
         """
@@ -129,15 +129,15 @@ class RPM(WindowlessModel):
             h = layer(h)
         return self.head(h[..., -self.horizon :, :]).view(future.shape)
 
-    def roll(self, encoded: Tensor, state: State) -> tuple[Tensor, State]:
-        """Take in one frame.
+    def step_frame(self, encoded: Tensor, state: State) -> tuple[Tensor, State]:
+        """Process one frame.
 
         Args:
             encoded: inputs (B, 1, 54) in network space.
             state: the state before that frame.
 
         Returns:
-            The prediction (B, W, 132) that begins with that frame, in network space, and the state after it.
+            The prediction (B, W, 132) from that frame on, in network space, and the new state.
         """
         before = torch.where(state["started"][..., None] > 0, state["sparse"], encoded)
         inputs = torch.cat([before, encoded], 1)
@@ -160,16 +160,15 @@ class RPM(WindowlessModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         shown = []
         for frame in self.encode(sparse).split(1, 1):
-            made, state = self.roll(frame, state)
+            made, state = self.step_frame(frame, state)
             shown.append(made[:, :1])
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call: a few frames of free running without gradients, then one step with gradients.
+        """Run over a few frames without gradients, then predict with gradients; see MotionModel.
 
-        The number of free-running frames is drawn for each call. The step predicts the window's last W
-        frames; see MotionModel.
+        The number of frames without gradients is random. The last step predicts the window's last W frames.
         """
         now = self.frames - self.horizon
         begin = now - int(torch.randint(now - self.context + 1, ()))
@@ -177,7 +176,7 @@ class RPM(WindowlessModel):
         past = slice(begin - self.context, begin)
         motion = self.normalizer.encode(true_frames[:, past])[..., SPARSE_DIM:][..., ROTATION]
         drawn = distributed.draw_rows(torch.rand_like, true_frames[:, past][:, :1, 0])
-        known = (drawn >= FRESH).to(true_frames.dtype)  # the other windows start without a past
+        known = (drawn >= FRESH_FRACTION).to(true_frames.dtype)  # the other windows start without a past
         state = state | {
             "sparse": known[..., None] * encoded[:, past],
             "motion": known[..., None] * motion,
@@ -187,8 +186,8 @@ class RPM(WindowlessModel):
         self.train(training and self.own_dropout)
         with torch.no_grad():
             for index in range(begin, now):
-                _, state = self.roll(encoded[:, index : index + 1], state)
+                _, state = self.step_frame(encoded[:, index : index + 1], state)
         self.train(training)
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
-        made, state = self.roll(encoded[:, now : now + 1], state)
+        made, state = self.step_frame(encoded[:, now : now + 1], state)
         return TrainingOutputs(self.normalizer.posed(made, sparse[:, now:]), state, {})

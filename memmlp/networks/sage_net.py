@@ -1,4 +1,4 @@
-"""SAGE-Net (Feng et al., CVPR 2024): diffusion makes latents of the body's halves, a decoder makes the pose.
+"""SAGE-Net (Feng et al., CVPR 2024): diffusion generates latents of body halves, and a decoder the pose.
 
 Its parts are trained one after the other (memmlp.training.train_sage), and then together.
 """
@@ -19,14 +19,21 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import Diffusion
 from memmlp.networks.motion_model import NewestFrameModel, State, TrainingOutputs
-from memmlp.networks.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser, make_places
+from memmlp.networks.sage_parts import (
+    LATENT,
+    Decoder,
+    HalfVQVAE,
+    LowerDenoiser,
+    UpperDenoiser,
+    make_position_embeddings,
+)
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.streaming import StemGraph, linear
+from memmlp.networks.streaming import StemGraph, make_linear
 from memmlp.networks.transformer import DiTBlock
 
 
 class DenoiserAtSamplingTimes(nn.Module):
-    """A denoiser restricted to the diffusion times at which samples are made.
+    """A denoiser for the sampling times only, with precomputed modulations.
 
     Args:
         denoiser: the denoiser.
@@ -43,25 +50,29 @@ class DenoiserAtSamplingTimes(nn.Module):
         made = torch.stack([block.modulation(embedding) for block in self.blocks], 1)
         self.register_buffer("modulations", made)
         seen, noisy = weight.split([weight.shape[1] - LATENT, LATENT], 1)
-        self.denoiser, self.seen, self.noisy = denoiser, linear(seen, denoiser.stem.bias), linear(noisy)
+        self.denoiser, self.seen, self.noisy = (
+            denoiser,
+            make_linear(seen, denoiser.stem.bias),
+            make_linear(noisy),
+        )
 
     def condition(self, seen: Tensor) -> Tensor:
-        """Return the condition (T // 2, d) that the stem makes from the window's inputs as carried (T, d)."""
+        """Return the condition (T // 2, d) for the window's carried features (T, d)."""
         return self.seen(self.denoiser.condition.shorten(seen))
 
     def forward(self, noisy: Tensor, condition: Tensor, index: int) -> Tensor:
-        """Map noisy latents (T // 2, 384) at sampling step `index` to clean ones."""
+        """Map noisy latents (T // 2, 384) at sampling step `index` to clean latents."""
         h = condition + self.noisy(self.denoiser.align_frames(noisy))
         for block, modulation in zip(self.blocks, self.modulations[index], strict=True):
-            h = block.newest(h, modulation.chunk(6), h.shape[-2])
+            h = block.compute_newest(h, modulation.chunk(6), h.shape[-2])
         return self.denoiser.head(h)
 
 
 class SAGENetGraph(StemGraph):
-    """SAGE-Net's streaming graph, which carries what each of the three parts computes from single frames.
+    """SAGE-Net's streaming graph, which carries the per-frame features of its three parts.
 
-    What the blocks compute from the diffusion times is the same at every step of a stream, so it is computed
-    once. The decoder makes the newest frame alone.
+    The blocks' modulations by the diffusion times are the same at every step of a stream, so they are
+    computed once. The decoder computes only the newest frame.
     """
 
     float32_modules: tuple[str, ...] = ("sparse", "decoder.heads")
@@ -82,9 +93,10 @@ class SAGENetGraph(StemGraph):
 
         nothing = torch.zeros(1, SPARSE_DIM).to(model.noises)
         offset = entering(nothing)
-        self.sparse = linear((entering(torch.eye(SPARSE_DIM).to(nothing)) - offset).T, offset[0])
+        self.sparse = make_linear((entering(torch.eye(SPARSE_DIM).to(nothing)) - offset).T, offset[0])
         self.register_buffer(
-            "places", make_places(nothing.new_zeros(self.frames // 2, model.decoder.stem.out_features))
+            "places",
+            make_position_embeddings(nothing.new_zeros(self.frames // 2, model.decoder.stem.out_features)),
         )
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
@@ -106,12 +118,12 @@ class SAGENetGraph(StemGraph):
         sampler: DenoiserAtSamplingTimes,
         seen: Tensor,
         noise: Tensor,
-        joined: Callable[[Tensor], Tensor],
+        merge_latents: Callable[[Tensor], Tensor],
     ) -> Tensor:
-        """Sample latents (T // 2, 384) from noise, given what the denoiser has of the window (T, d)."""
+        """Sample latents (T // 2, 384) from noise, given the denoiser's carried window features (T, d)."""
         condition, noisy = sampler.condition(seen), noise
         for index in range(len(self.diffusion.times)):
-            clean = sampler(joined(noisy), condition, index)
+            clean = sampler(merge_latents(noisy), condition, index)
             if index + 1 < len(self.diffusion.times):
                 noisy = self.diffusion.step(noisy, clean, index)
         return clean
@@ -120,11 +132,11 @@ class SAGENetGraph(StemGraph):
 @component("model", "sage", builds="SAGENet")
 @dataclass
 class SAGESettings(NetworkSettings):
-    """SAGE-Net (Feng et al. 2024): two diffusion models of the body halves' latents, and a decoder.
+    """SAGE-Net (Feng et al. 2024): a diffusion model for the latents of each body half, and a decoder.
 
-    Its parts are trained before it, in prerequisite runs; then optim trains both diffusion models and the
-    decoder together, through the sampler. Its refiner is refiner=sage, which can stand behind any
-    network. Losses, learning rates and features are those of its released code.
+    Prerequisite runs train its parts. Then optim trains both diffusion models and the decoder together,
+    through the sampler. Its refiner is refiner=sage, which can follow any network. Losses, learning rates and
+    features follow its released code.
     """
 
     frames: int = setting(at_least(2), tiny=8, small=20, paper=20)  # T, the frames of a window
@@ -156,13 +168,12 @@ class SAGESettings(NetworkSettings):
 
 
 class SAGENet(NewestFrameModel):
-    """Samples the upper half's latents, then the lower half's given these, and decodes both to a pose.
+    """SAGE-Net: samples the upper half's latents, then the lower half's latents, and decodes both to a pose.
 
-    It has 120,269,534 parameters at the paper's sizes (120.27 M in Table 16); the VQ-VAEs that make the
-    latents it learns from are not part of it. Every frame is the last one of its own window, and only that
-    frame has losses.
-
-    The noise that sampling starts from is always the same, drawn from `noise_seed`, as AGRoLDiffusion's is.
+    It has 120,269,534 parameters at the paper's sizes (120.27 M in Table 16); the VQ-VAEs that provide its
+    training latents are not included. Every frame is predicted as the last frame of its own window, and only
+    that frame has losses. Sampling always starts from the same noise, drawn with `noise_seed`, like
+    AGRoLDiffusion.
     """
 
     graph = SAGENetGraph
@@ -180,7 +191,7 @@ class SAGENet(NewestFrameModel):
         )
 
     def make_codes(self, joints: tuple[int, ...]) -> HalfVQVAE:
-        """Make a VQ-VAE with fresh weights for the half of the body that has the given joints."""
+        """Make a VQ-VAE with random weights for the body half with the given joints."""
         return HalfVQVAE(joints, self.settings)
 
     def sample_upper(self, encoded: Tensor) -> Tensor:
@@ -192,10 +203,10 @@ class SAGENet(NewestFrameModel):
         )
 
     def sample_lower(self, upper: Tensor, encoded: Tensor) -> Tensor:
-        """Sample the lower half's latents for inputs (B, T, 54), given the upper half's (B, T // 2, 384)."""
+        """Sample the lower half's latents for inputs (B, T, 54) and upper latents (B, T // 2, 384)."""
         condition = self.lower.condition(encoded)
         return self.diffusion.sample(
-            lambda noisy, time: self.lower.denoise(self.lower.join(noisy, upper), time, condition),
+            lambda noisy, time: self.lower.denoise(self.lower.merge_latents(noisy, upper), time, condition),
             self.noises[1].expand(len(encoded), -1, -1),
         )
 
@@ -204,5 +215,5 @@ class SAGENet(NewestFrameModel):
         return self.decoder(upper, self.sample_lower(upper, encoded), encoded)[:, -1]
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call through both samplers, for the newest frame alone; see MotionModel."""
+        """Predict the newest frame through both samplers; see MotionModel."""
         return TrainingOutputs(*self.advance(sparse, state, 1), {})

@@ -1,8 +1,9 @@
-"""The networks of SAGE-Net (Feng et al., CVPR 2024): the body's halves as codes, their diffusion, a decoder.
+"""SAGE-Net's parts (Feng et al., CVPR 2024): VQ-VAEs of the body halves, diffusion models and decoder.
 
-A VQ-VAE of each half makes latents of a window; one diffusion model makes the upper half's latents from the
-inputs, another makes the lower half's from the inputs and the upper latents; the decoder makes rotations from
-both. The refiner that follows is memmlp.networks.refiner. All latents are (B, T // 2, 384).
+A VQ-VAE for each half encodes a window as latents. A diffusion model predicts the upper half's latents from
+the inputs. A second model predicts the lower half's latents from the inputs and the upper latents. The
+decoder computes rotations from both. The refiner is in memmlp.networks.refiner. All latents are (B, T // 2,
+384).
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class AttentionBlock(nn.Module):
 
     Args:
         width: d, the width of the features.
-        heads: number of attention heads; it divides d.
+        heads: number of attention heads, a divisor of d.
         dropout: dropout rate of both parts' outputs, while training.
     """
 
@@ -66,10 +67,10 @@ class AttentionBlock(nn.Module):
 
     def forward(self, h: Tensor) -> Tensor:
         """Map features (B, T, d) to (B, T, d)."""
-        return self.newest(h, h.shape[-2])
+        return self.compute_newest(h, h.shape[-2])
 
-    def newest(self, h: Tensor, count: int) -> Tensor:
-        """Map features (..., T, d) to those of the newest frames (..., count, d), without the rest."""
+    def compute_newest(self, h: Tensor, count: int) -> Tensor:
+        """Map features (..., T, d) to the newest `count` frames' features, without computing older frames."""
         seen = self.attention_norm(h)
         h = h[..., -count:, :] + self.dropout(self.attention(seen[..., -count:, :], seen))
         return h + self.dropout(self.mlp(self.norm(h)))
@@ -81,7 +82,7 @@ class Stack(nn.Module):
     Args:
         width: d, the width of the features.
         depth: number of blocks.
-        heads: number of attention heads; it divides d.
+        heads: number of attention heads, a divisor of d.
         dropout: dropout rate in the blocks, while training.
     """
 
@@ -91,7 +92,7 @@ class Stack(nn.Module):
         self.norm, self.head = nn.LayerNorm(width), nn.Linear(width, width, bias=False)
 
     def prepare(self, h: Tensor) -> Tensor:
-        """Map features (B, T, d) to those that the blocks get; by default unchanged."""
+        """Map features (B, T, d) to the blocks' input; by default unchanged."""
         return h
 
     def finish(self, h: Tensor) -> Tensor:
@@ -101,10 +102,10 @@ class Stack(nn.Module):
     def forward(self, h: Tensor) -> Tensor:
         """Map features (B, T, d) to features (B, T', d)."""
         h = self.prepare(h)
-        return self.head(self.norm(self.finish(self.blocks(h + make_places(h)))))
+        return self.head(self.norm(self.finish(self.blocks(h + make_position_embeddings(h)))))
 
 
-def make_places(h: Tensor) -> Tensor:
+def make_position_embeddings(h: Tensor) -> Tensor:
     """Return position embeddings (T, d) for features (B, T, d), d even (Vaswani et al. 2017, Sec. 3.5).
 
     They are sines and cosines.
@@ -115,8 +116,8 @@ def make_places(h: Tensor) -> Tensor:
     return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2).to(h)
 
 
-class Shortened(Stack):
-    """Blocks after a convolution over time and a maximum over every two frames: T to T // 2 frames."""
+class ShorteningStack(Stack):
+    """A convolution over time and a maximum over every two frames (T to T // 2), then blocks."""
 
     def __init__(self, width: int, depth: int, heads: int, dropout: float):
         super().__init__(width, depth, heads, dropout)
@@ -126,7 +127,7 @@ class Shortened(Stack):
         return F.max_pool1d(self.convolution(h.transpose(1, 2)), 2).transpose(1, 2)
 
 
-class Lengthened(Stack):
+class LengtheningStack(Stack):
     """Blocks, then a transposed convolution over time that doubles the frames (T to 2T)."""
 
     def __init__(self, width: int, depth: int, heads: int, dropout: float):
@@ -137,12 +138,12 @@ class Lengthened(Stack):
         return self.convolution(h.transpose(1, 2))[..., 1:].transpose(1, 2)
 
     def predict_last(self, h: Tensor, at: Tensor) -> Tensor:
-        """Map features (T, d) and their position embeddings (T, d) to the last of 2 T frames (1, d) alone."""
+        """Map features and their position embeddings (T, d) to only the last of 2 T frames (1, d)."""
         *earlier, block = self.blocks
         h = h + at
         for one in earlier:
             h = one(h)
-        newest = cast(AttentionBlock, block).newest(h, 1)
+        newest = cast(AttentionBlock, block).compute_newest(h, 1)
         newest = F.linear(newest, self.convolution.weight[..., -1].T, self.convolution.bias)
         return self.head(self.norm(newest))
 
@@ -150,11 +151,11 @@ class Lengthened(Stack):
 class ProductQuantiser(nn.Module):
     """Eight codebooks of 64 vectors of 48, one for each part of a latent, learned by gradient.
 
-    While training, code-vectors that are hardly used move towards the nearest latents; see `revive`.
+    While training, rarely used code-vectors move towards the nearest latents; see `move_unused_codes`.
     """
 
     usage: Tensor
-    of_whole_batch = True  # several processes would each count and move codes by themselves
+    needs_whole_batch = True  # several processes would each count and move codes by themselves
 
     def __init__(self) -> None:
         super().__init__()
@@ -177,18 +178,18 @@ class ProductQuantiser(nn.Module):
             codes = codes.flatten(-2).view_as(z)
             loss = (codes.detach() - z).square().mean() + (codes - z.detach()).square().mean()
             if self.training:
-                self.revive(parts.detach(), distance.detach(), index)
+                self.move_unused_codes(parts.detach(), distance.detach(), index)
                 loss = loss + sum(compute_contrast(one) for one in distance[:CONTRASTED])
             return z + (codes - z).detach(), loss
 
     @torch.no_grad()
-    def revive(self, parts: Tensor, distance: Tensor, index: Tensor) -> None:
-        """Move each code-vector towards its nearest latent, the more the less the code-vector is used.
+    def move_unused_codes(self, parts: Tensor, distance: Tensor, index: Tensor) -> None:
+        """Move code-vectors towards their nearest latents; rarely used code-vectors move furthest.
 
         Args:
             parts: the latents' parts (8, N, 48).
             distance: squared distances (8, N, 64) between parts and code-vectors.
-            index: the index of each part's nearest code-vector (8, N).
+            index: index of the code-vector nearest to each part (8, N).
         """
         share = F.one_hot(index, CODES).to(parts).mean(1)
         self.usage.lerp_(share, 1 - DECAY)
@@ -198,7 +199,7 @@ class ProductQuantiser(nn.Module):
 
 
 def compute_contrast(distance: Tensor) -> Tensor:
-    """Return a codebook's contrastive loss: near for the latents closest to a code, far for the farther half.
+    """Return a codebook's contrastive loss, with each code's nearest latents against the farther half.
 
     Args:
         distance: squared distances (N, 64) between latents and code-vectors.
@@ -214,7 +215,7 @@ class HalfVQVAE(nn.Module):
 
     Args:
         joints: the joints of the half.
-        settings: the network's settings, of which `code_*` and `dropout` are used here.
+        settings: the network's settings; only `code_*` and `dropout` are used.
     """
 
     def __init__(self, joints: tuple[int, ...], settings: Any):
@@ -224,17 +225,17 @@ class HalfVQVAE(nn.Module):
         self.joints, count = joints, len(joints)
         self.mixture = Mixture(count)
         self.stem = nn.Linear(count * (6 + JOINT_DIM), width)
-        self.encoder = Shortened(*blocks)
+        self.encoder = ShorteningStack(*blocks)
         self.into, self.out_of = nn.Linear(width, LATENT), nn.Linear(LATENT, width)
         self.quantiser = ProductQuantiser()
-        self.decoder = Lengthened(*blocks)
+        self.decoder = LengtheningStack(*blocks)
         self.head = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, count * 6))
 
     def encode(self, rotation: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
         """Return quantised latents (B, T // 2, 384) and their loss.
 
         Args:
-            rotation: rotations (B, T, 132) of all joints, of which only those of this half are used.
+            rotation: rotations (B, T, 132) of all joints; only this half's joints are used.
             encoded: inputs (B, T, 54).
         """
         own = rotation.unflatten(-1, (N_JOINTS, 6))[..., list(self.joints), :]
@@ -246,8 +247,8 @@ class HalfVQVAE(nn.Module):
         return self.head(self.decoder(self.out_of(latent)))
 
 
-class Halved(nn.Module):
-    """Maps a window's inputs to features of half as many frames: mixes them over joints, then over time.
+class HalfRateEncoder(nn.Module):
+    """Maps a window's inputs to features of T // 2 frames, by mixing over joints, then over time.
 
     Args:
         frames: T, the window's length.
@@ -265,7 +266,7 @@ class Halved(nn.Module):
 
         Args:
             encoded: inputs (B, T, 54).
-            hidden: which joints (B, 22) are hidden in training; None for none.
+            hidden: mask (B, 22) of hidden joints in training; None without hidden joints.
         """
         mixed = self.mixture(encoded)
         if hidden is not None:
@@ -287,7 +288,7 @@ class UpperDenoiser(nn.Module):
     def __init__(self, settings: Any):
         super().__init__()
         frames, width = settings.frames, settings.width
-        self.condition = Halved(frames, width)
+        self.condition = HalfRateEncoder(frames, width)
         self.time = TimeEmbedding(width, SINES)
         self.align = nn.Linear(frames // 2, frames // 2)
         self.stem = nn.Linear(width + LATENT, width)
@@ -301,12 +302,12 @@ class UpperDenoiser(nn.Module):
     def forward(self, noisy: Tensor, time: Tensor, encoded: Tensor, hidden: Tensor | None = None) -> Tensor:
         """Map noisy latents (B, T // 2, 384), times (B,) and inputs (B, T, 54) to clean latents.
 
-        In training, `hidden` says which joints (B, 22) are hidden; see Halved.
+        In training, `hidden` is a mask (B, 22) of hidden joints; see HalfRateEncoder.
         """
         return self.denoise(noisy, time, self.condition(encoded, hidden))
 
     def denoise(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Map noisy latents (B, T // 2, 384), times (B,) and a condition (B, T // 2, d) to clean ones."""
+        """Map noisy latents (B, T // 2, 384), times (B,) and a condition (B, T // 2, d) to clean latents."""
         h = self.stem(torch.cat([condition, self.align_frames(noisy)], -1))
         embedding = F.silu(self.time(time))
         for block in self.blocks:
@@ -315,30 +316,30 @@ class UpperDenoiser(nn.Module):
 
 
 class LowerDenoiser(UpperDenoiser):
-    """Predicts the lower half's clean latents, given the upper half's as well; 58,264,728 parameters."""
+    """Predicts the lower half's clean latents, also from the upper half's latents; 58,264,728 parameters."""
 
     def __init__(self, settings: Any):
         super().__init__(settings)
         self.beside = nn.Linear(2 * LATENT, LATENT)
 
-    def join(self, noisy: Tensor, upper: Tensor) -> Tensor:
-        """Merge noisy latents (..., 384) and the upper half's latents (..., 384) into one (..., 384)."""
+    def merge_latents(self, noisy: Tensor, upper: Tensor) -> Tensor:
+        """Merge noisy latents and the upper half's latents (..., 384) into one tensor (..., 384)."""
         return self.beside(torch.cat([upper, noisy], -1))
 
 
 class Decoder(nn.Module):
-    """Makes rotations from both halves' latents and the inputs; 4,035,374 parameters.
+    """Computes rotations from both halves' latents and the inputs; 4,035,374 parameters.
 
     Args:
-        settings: the network's settings, of which `frames`, `code_*` and `dropout` are used here.
+        settings: the network's settings; only `frames`, `code_*` and `dropout` are used.
     """
 
     def __init__(self, settings: Any):
         super().__init__()
         width = settings.code_width
-        self.condition = Halved(settings.frames, LATENT)
+        self.condition = HalfRateEncoder(settings.frames, LATENT)
         self.stem = nn.Linear(3 * LATENT, width)
-        self.stack = Lengthened(width, settings.code_depth, settings.code_heads, settings.dropout)
+        self.stack = LengtheningStack(width, settings.code_depth, settings.code_heads, settings.dropout)
         sizes = 6, ROTATION.stop - 6
         self.heads = nn.ModuleList(
             nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size)) for size in sizes

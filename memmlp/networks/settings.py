@@ -1,4 +1,4 @@
-"""The settings that all networks without slots have in common. Imports no torch."""
+"""The common settings of networks without slots. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from memmlp.common.settings import Settings, at_least, setting
 
 @dataclass
 class NetworkSettings(Settings):
-    """The settings of a network that has no slots: memory, predictor, hand and term are null with it.
+    """The settings of a network without slots, which needs memory, predictor, hand and term to be null.
 
     Attributes:
         learns_newest_frame: whether training learns only the newest frame of each window.
@@ -34,20 +34,20 @@ class NetworkSettings(Settings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield which keys of a config need another network; see Settings."""
+        """Yield problems of config keys that do not fit the network; see Settings."""
         model, name = config["model"], config["model"]["name"]
         for slot in ("memory", "predictor", "hand", "term"):
             if config[slot] is not None:
                 yield f"{slot}: must be null with model={name}, which does not have this slot"
         loss, rollout = config["loss"]["name"], config["rollout"]["name"]
         if loss == "of_network" and not cls.trains_by_itself:
-            yield f"loss=of_network: must be another loss, since model={name} has no loss of its own"
+            yield f"loss=of_network: must be another loss, since model={name} does not have its own loss"
         if not getattr(find_chosen_settings(config, "loss"), "complete", False):
             yield f"loss={loss}: must be a complete loss, such as the default of model={name}"
         if rollout not in ("teacher_forcing", *(["streams"] if cls.carries_state else [])):
             yield f"rollout={rollout}: must be teacher_forcing with model={name}"
         if config["evaluation"]["ik"] == "lbfgs":
-            yield f"evaluation.ik=lbfgs: must be off or arms, since model={name} predicts no positions"
+            yield f"evaluation.ik=lbfgs: must be off or arms, since model={name} does not predict positions"
         for heads, width in (("heads", "width"), ("code_heads", "code_width")):
             if heads in model and model[width] % model[heads]:
                 yield f"model.{heads}={model[heads]}: must be a divisor of model.{width}={model[width]}"
@@ -64,15 +64,15 @@ class NetworkSettings(Settings):
 
     @classmethod
     def prerequisite_option(cls) -> str | None:
-        """Return the option of `prerequisite` that trains the network's parts first; None for no parts."""
+        """Return the option of `prerequisite` that the network needs; None without a prerequisite."""
         return cls.defaults.get("prerequisite")
 
 
 def _offline_problems(config: Any) -> Iterator[str]:
     if list(config["evaluation"]["modes"]) != ["window"] or config["export"]["graph"] != "off":
         yield (
-            "model.offline=true: needs evaluation.modes=[window] and export.graph=off, since it uses future "
-            "frames"
+            "model.offline=true: needs evaluation.modes=[window] and export.graph=off, since it uses "
+            "future frames"
         )
     if config["refiner"] is not None:
         yield "refiner: must be null with model.offline=true, since a refiner corrects a stream"

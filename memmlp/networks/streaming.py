@@ -1,7 +1,7 @@
-"""Streaming graphs, from which the live step is exported: a network that computes nothing twice.
+"""Streaming graphs, which are exported for live use and do not compute values twice.
 
-What depends on a single frame is computed when the frame enters the window, and carried in the state. The
-last layers compute only what the newest frame needs.
+Values that depend on a single frame are computed once, when the frame enters the window, and carried in the
+state. The last layers compute only the newest frame.
 """
 
 from __future__ import annotations
@@ -24,35 +24,39 @@ def streaming(model: MotionModel) -> StreamingGraph:
     """Make the streaming graph of a trained network, without changing the network.
 
     Raises:
-        InputError: if the network does not have a streaming graph. Its estimates of past frames may change at
-            each step (`memory.history=latest`), it may use future frames, or a custom part may lack a graph.
+        InputError: if the network does not have a streaming graph: estimates of past frames change at each
+            step (`memory.history=latest`), it uses future frames, or a custom part does not have a graph.
     """
     if not model.settled:
         raise InputError(
-            "export.graph=streaming: must be naive with memory.history=latest or such a custom memory, since "
-            "estimates of past frames change at each step; or set memory.history=first"
+            "export.graph=streaming: must be naive, since the memory's estimates of past frames change at "
+            "each step; or set memory.history=first"
         )
-    check_streams(model)
-    if not has_stream(model):
-        raise InputError("export.graph=streaming: must be naive, since a custom part has no streaming graph")
+    check_is_stream(model)
+    if not has_streaming_graph(model):
+        raise InputError(
+            "export.graph=streaming: must be naive, since a custom part does not have a streaming graph"
+        )
     graph = vars(type(model))["graph"]
     return graph(model)
 
 
-def check_streams(model: MotionModel) -> None:
+def check_is_stream(model: MotionModel) -> None:
     """Raise InputError for an offline network, which uses future frames."""
     if not model.is_stream:
-        raise InputError("model.offline=true: must be false for a stream, since it uses future frames")
+        raise InputError(
+            "model.offline=true: must be false for a stream, since the network uses future frames"
+        )
 
 
-def has_stream(model: MotionModel) -> bool:
-    """Return whether a network has a streaming graph; custom parts may lack one."""
+def has_streaming_graph(model: MotionModel) -> bool:
+    """Return whether a network has a streaming graph; a network with custom parts may not have one."""
     graph: type[StreamingGraph] | None = vars(type(model)).get("graph")  # not the graph of a base class
     return graph is not None and model.settled and model.is_stream and graph.fits(model)
 
 
-def linear(weight: Tensor, bias: Tensor | None = None) -> nn.Linear:
-    """Return the linear layer of a weight (m, n) and a bias (m,)."""
+def make_linear(weight: Tensor, bias: Tensor | None = None) -> nn.Linear:
+    """Make a linear layer from a weight (m, n) and a bias (m,)."""
     layer = nn.Linear(weight.shape[1], weight.shape[0], bias is not None).to(weight)
     layer.weight = nn.Parameter(weight.contiguous())
     if bias is not None:
@@ -61,7 +65,7 @@ def linear(weight: Tensor, bias: Tensor | None = None) -> nn.Linear:
 
 
 class FrameGRU(nn.Module):
-    """GRU layers for one frame, written as plain layers, since not every runtime has a GRU.
+    """GRU layers for one frame, made of plain layers, because not every runtime has a GRU.
 
     Args:
         gru: the layers, batch first.
@@ -80,17 +84,17 @@ class FrameGRU(nn.Module):
         return h[:, None], torch.stack(after)
 
 
-Way = Callable[[Tensor, Tensor], Tensor]
+Conversion = Callable[[Tensor, Tensor], Tensor]
 
 
 class OneFrameNormalizer(Normalizer):
-    """A normalizer of single frames, whose conversions are matrices.
+    """A normalizer for single frames, which converts by matrix products.
 
-    For a given turn of the coordinates the conversions are linear, and their matrices are linear in the
-    cosine and sine of the heading. So the matrices are found by converting a basis.
+    For a given heading of the coordinates the conversions are linear. Their matrices are linear in the
+    heading's cosine and sine. Converting a basis therefore gives the matrices.
 
     Args:
-        normalizer: the normalizer whose conversions these are.
+        normalizer: the normalizer to reproduce.
     """
 
     def __init__(self, normalizer: Normalizer):
@@ -113,10 +117,10 @@ class OneFrameNormalizer(Normalizer):
         def turn_rotations(x: Tensor, turn: Tensor) -> Tensor:
             return exact.rotations_out(x, F.pad(turn.expand(len(x), -1), (3, 0)))
 
-        self.encoder = OneFrame(encode, SPARSE_DIM, turns)
-        self.decoder = OneFrame(decode, MOTION_DIM + 3, turns)
-        self.rotation_decoder = OneFrame(decode_rotations, ROTATION.stop, turns)
-        self.rotation_turner = OneFrame(turn_rotations, ROTATION.stop, turns)
+        self.encoder = OneFrameConversion(encode, SPARSE_DIM, turns)
+        self.decoder = OneFrameConversion(decode, MOTION_DIM + 3, turns)
+        self.rotation_decoder = OneFrameConversion(decode_rotations, ROTATION.stop, turns)
+        self.rotation_turner = OneFrameConversion(turn_rotations, ROTATION.stop, turns)
         self.to(normalizer.mean)
 
     def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
@@ -138,22 +142,22 @@ class OneFrameNormalizer(Normalizer):
         return torch.cat([world, self.pose(motion, sparse).flatten(-2)], -1)
 
 
-class OneFrame(nn.Module):
-    """A conversion of one frame that is linear for any given turn of the coordinates.
+class OneFrameConversion(nn.Module):
+    """A conversion of one frame that is linear for a given turn of the coordinates.
 
     Args:
-        way: the conversion, of vectors (n, in) and a turn (turns,) to vectors (n, out), in float64.
+        convert: the conversion, of vectors (n, in) and a turn (turns,) to vectors (n, out), in float64.
         size: in.
-        turns: how many numbers a turn has.
+        turns: number of values in a turn.
     """
 
-    def __init__(self, way: Way, size: int, turns: int):
+    def __init__(self, convert: Conversion, size: int, turns: int):
         super().__init__()
         tried = [torch.zeros(turns).double(), *torch.eye(turns).double()]
-        offsets = torch.stack([way(torch.zeros(1, size).double(), turn) for turn in tried])
+        offsets = torch.stack([convert(torch.zeros(1, size).double(), turn) for turn in tried])
         basis = torch.eye(size).double()
         matrices = torch.stack(
-            [way(basis, turn) - offset for turn, offset in zip(tried, offsets, strict=True)]
+            [convert(basis, turn) - offset for turn, offset in zip(tried, offsets, strict=True)]
         )
         offsets[1:] -= offsets[:1]  # what each of the turn's numbers adds
         matrices[1:] -= matrices[:1]
@@ -162,24 +166,24 @@ class OneFrame(nn.Module):
         self.bias = nn.Parameter(offsets.reshape(-1))
 
     def forward(self, x: Tensor, origin: Tensor) -> Tensor:
-        """Map x (1, in) at an origin (1, 3 or 5): the sum of all products, each times its number."""
+        """Convert x (1, in) at an origin (1, 3 or 5) to (1, out)."""
         products = F.linear(x, self.weight, self.bias).view(self.parts, self.out)
         turn = torch.cat([torch.ones_like(origin[:, :1]), origin[:, 3:]], -1)
         return turn @ products
 
 
 class StemGraph(StreamingGraph):
-    """The base of the streaming graphs of windowed networks; it carries what a stem makes of each frame.
+    """The base class of windowed networks' streaming graphs, which carries a stem's output for each frame.
 
     Attributes:
-        width: d, how many numbers are carried of a frame.
+        width: d, the number of values carried for each frame.
     """
 
     float32_modules: tuple[str, ...] = ("model.stem", "model.head")
     width: int
 
     def windows(self) -> State:
-        """Return zeros (T - 1, d): what is carried of each earlier frame, in order of time."""
+        """Return zeros (T - 1, d) for the carried values of earlier frames, oldest first."""
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
@@ -189,9 +193,9 @@ class StemGraph(StreamingGraph):
         return self.normalizer.posed(self.predict_rotation(window, encoded), sparse), {"stem": window[1:]}
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
-        """Map one frame's inputs (1, 54) in network space to what is carried of it (1, d)."""
+        """Map one frame's inputs (1, 54) in network space to its carried values (1, d)."""
         raise NotImplementedError
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
-        """Map a window (T, d), and its newest frame's inputs (1, 54), to that frame's rotations (1, 132)."""
+        """Map a window (T, d) and its newest frame's inputs (1, 54) to rotations (1, 132)."""
         raise NotImplementedError

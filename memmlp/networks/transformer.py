@@ -1,4 +1,4 @@
-"""The transformer blocks that several networks are made of."""
+"""Transformer blocks for several networks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Attention(nn.Module):
 
     Args:
         width: d, the width of the features.
-        heads: number of heads; it divides d.
+        heads: number of heads, a divisor of d.
     """
 
     def __init__(self, width: int, heads: int):
@@ -31,12 +31,12 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
 
     def forward(self, h: Tensor, seen: Tensor | None = None) -> Tensor:
-        """Map features (B, n, d) to (B, n, d); they attend to `seen` (B, T, d), by default to themselves."""
+        """Map features (B, n, d) to (B, n, d), with attention to `seen` (B, T, d) or to themselves."""
         seen = h if seen is None else seen
         return self.attend(self.query(h), self.key(seen), self.value(seen))
 
     def attend(self, *parts: Tensor) -> Tensor:
-        """Attend with queries (B, n, d) to keys (B, T, d) and values (B, T, d), given in this order.
+        """Compute attention from queries (B, n, d), keys (B, T, d) and values (B, T, d), in this order.
 
         Returns:
             (B, n, d).
@@ -54,7 +54,7 @@ class EncoderLayer(nn.Module):
         heads: number of attention heads.
         feedforward: width of the feed-forward's hidden layer.
         dropout: dropout rate of both parts' outputs and of the hidden layer.
-        activation: what follows the hidden layer.
+        activation: the activation after the hidden layer.
     """
 
     def __init__(
@@ -77,27 +77,27 @@ class EncoderLayer(nn.Module):
         return self.finish(h, self.attention(h))
 
     def finish(self, h: Tensor, attended: Tensor) -> Tensor:
-        """Apply what follows the attention, frame by frame, to its inputs and outputs (..., d)."""
+        """Apply the remaining layers to the attention's inputs and outputs (..., d), frame by frame."""
         h = self.attention_norm(h + self.dropout(attended))
         wide = self.dropout(self.activation(self.widen(h)))
         return self.norm(h + self.dropout(self.narrow(wide)))
 
 
 def make_encoder(settings: Any, depth: int, activation: Callable[[Tensor], Tensor] = F.relu) -> nn.ModuleList:
-    """Make `depth` encoder layers by a network's settings: width, heads, feedforward and dropout."""
+    """Make `depth` encoder layers with a network's width, heads, feedforward and dropout."""
     sizes = settings.width, settings.heads, settings.feedforward, settings.dropout
     return nn.ModuleList(EncoderLayer(*sizes, activation) for _ in range(depth))
 
 
 @torch.no_grad()
 def draw_weights(part: nn.Module) -> None:
-    """Draw initial weights of linear layers as AvatarPoser's released code, and code derived from it, does.
+    """Draw the initial weights of linear layers like AvatarPoser's released code.
 
-    They have Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2, so that a network begins with
-    small outputs: near the mean pose where there are z-scores. Biases are 0; the released code leaves them as
-    torch draws them, and keeps weights within 0.2. In torch's own attention, queries, keys and values share
-    one matrix, which the released code leaves as torch draws it, by Xavier's uniform distribution (Glorot &
-    Bengio 2010, Eq. 16).
+    They have Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2, so that initial outputs are
+    small: near the mean pose with z-scores. Biases are 0. The released code keeps torch's initial biases
+    instead, and limits weights to 0.2. Queries, keys and values share one matrix in torch's attention. Its
+    initial weights have Xavier's uniform distribution (Glorot & Bengio 2010, Eq. 16), like in the released
+    code.
     """
     for layer in part.modules():
         if isinstance(layer, nn.Linear):
@@ -120,11 +120,11 @@ def encode_newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
 
 
 class DiTBlock(nn.Module):
-    """Attention and an MLP, shifted, scaled and gated by the diffusion time (Peebles & Xie 2023, adaLN).
+    """Attention and an MLP, which the diffusion time shifts, scales and gates (Peebles & Xie 2023, adaLN).
 
     Args:
         width: d, the width of the features.
-        heads: number of attention heads; it divides d.
+        heads: number of attention heads, a divisor of d.
         ratio: the width of the MLP's hidden layer, as a multiple of d.
     """
 
@@ -139,15 +139,15 @@ class DiTBlock(nn.Module):
 
     def forward(self, h: Tensor, time: Tensor) -> Tensor:
         """Map features (B, T, d) to (B, T, d), given the activated embedding (B, d) of the times."""
-        return self.newest(h, self.modulation(time)[..., None, :].chunk(6, -1), h.shape[-2])
+        return self.compute_newest(h, self.modulation(time)[..., None, :].chunk(6, -1), h.shape[-2])
 
-    def newest(self, h: Tensor, modulation: Sequence[Tensor], count: int) -> Tensor:
-        """Map features (..., T, d) to those of the newest frames (..., count, d), without making the others.
+    def compute_newest(self, h: Tensor, modulation: Sequence[Tensor], count: int) -> Tensor:
+        """Map features (..., T, d) to the newest `count` frames' features, without computing older frames.
 
         Args:
             h: features (..., T, d).
-            modulation: shift, scale and gate of the attention and of the MLP, broadcast to the features.
-            count: how many of the newest frames are wanted.
+            modulation: shift, scale and gate of attention and MLP, broadcast to the features.
+            count: number of newest frames to compute.
         """
         shift, scale, gate, mlp_shift, mlp_scale, mlp_gate = modulation
         seen = self.attention_norm(h) * (1 + scale) + shift

@@ -1,10 +1,9 @@
 """VAE-HMD (Dittadi et al., ICCV 2021): a variational autoencoder of poses, and an encoder from the trackers.
 
-Its authors published no code; sizes are those of the one public re-implementation. Its two stages, the
-autoencoder and then the encoder from the trackers over its frozen decoder, are trained side by side here:
-about half of a batch's windows are encoded from their true poses, and train the autoencoder; the others are
-encoded from the trackers, and train the encoder from the trackers through the decoder, whose weights they do
-not change.
+Its authors did not publish code; sizes follow the only public re-implementation. The paper first trains the
+autoencoder, then the tracker encoder with the frozen decoder. Here both are trained at the same time. About
+half of a batch's windows are encoded from true poses and train the autoencoder. The remaining windows are
+encoded from the trackers and train only the tracker encoder.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ TRACKERS = sum(part.stop - part.start for part in POSES)  # no velocities
 
 
 class Residual(nn.Module):
-    """Two linear layers, each after a LeakyReLU; a learned share of their output, at first 0, is added.
+    """A residual block of two linear layers, each after a LeakyReLU, with a learned gain, initially 0.
 
     Args:
         width: d, the width of inputs and outputs.
@@ -54,7 +53,7 @@ class Residual(nn.Module):
 
 
 class Perceptron(nn.Module):
-    """A linear layer to a width, residual blocks, and a linear layer to the outputs.
+    """A linear layer, residual blocks, and a linear output layer.
 
     Args:
         inputs: number of inputs.
@@ -76,16 +75,16 @@ class Perceptron(nn.Module):
 
 
 def compute_divergence(latent: Tensor) -> Tensor:
-    """Return the KL divergence of latents (..., 2 z), means and log variances, from the standard normal.
+    """Return the KL divergence of latents (means and log variances, (..., 2 z)) from the standard normal.
 
-    It is summed over the z components and averaged over all other axes.
+    The divergence is summed over the z components and averaged over all other axes.
     """
     mean, log_variance = latent.chunk(2, -1)
     return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
 
 
 def draw_latent(latent: Tensor) -> Tensor:
-    """Draw samples (..., z) from latents (..., 2 z), which are means and log variances."""
+    """Draw samples (..., z) from latents (..., 2 z), given as means and log variances."""
     mean, log_variance = latent.chunk(2, -1)
     return mean + (0.5 * log_variance).exp() * distributed.draw_rows(torch.randn_like, mean)
 
@@ -97,7 +96,7 @@ class VAEHMDGraph(FrameGraph):
     model: VAEHMD
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) to world motion (1, 198); nothing is carried on."""
+        """Map world inputs (1, 54) to world motion (1, 198); no state is carried."""
         mean = self.model.encode(sparse).chunk(2, -1)[0]
         return self.normalizer.posed(self.model.decoder(mean), sparse), {}
 
@@ -105,10 +104,10 @@ class VAEHMDGraph(FrameGraph):
 @component("model", "vae_hmd", builds="VAEHMD")
 @dataclass
 class VAEHMDSettings(NetworkSettings):
-    """VAE-HMD (Dittadi et al. 2021): a frame's trackers to the latent of a variational autoencoder of poses.
+    """VAE-HMD (Dittadi et al. 2021): maps a frame's trackers to the latent of a pose autoencoder.
 
-    No code of its authors is public: sizes are a re-implementation's. Its two stages are trained side by side
-    (reading).
+    The authors' code is not public; sizes follow a re-implementation. Its two stages are trained at the same
+    time (our reading).
     """
 
     # T, the frames of a training window, each a pose of its own; live there is no window
@@ -125,10 +124,10 @@ class VAEHMDSettings(NetworkSettings):
 
 
 class VAEHMD(WindowlessModel):
-    """An encoder of a frame's trackers to a latent, whose mean is decoded to the rotations of that frame.
+    """VAE-HMD: encodes a frame's trackers as a latent, and decodes the latent's mean to rotations.
 
-    It has 853,958 parameters at the sizes of its re-implementation. The encoder of whole poses, which
-    training alone uses, is not counted.
+    It has 853,958 parameters at the sizes of its re-implementation. The pose encoder, which only training
+    uses, is not counted.
     """
 
     graph = VAEHMDGraph
@@ -142,11 +141,11 @@ class VAEHMD(WindowlessModel):
         self.pose_encoder = Perceptron(MOTION_DIM, 2 * settings.latent, *sizes)
 
     def count_parameters(self) -> int:
-        """Count the trainable parameters of the network in use, without the encoder of whole poses."""
+        """Count the trainable parameters without the pose encoder, which only training uses."""
         return super().count_parameters() - sum(p.numel() for p in self.pose_encoder.parameters())
 
     def encode(self, sparse: Tensor) -> Tensor:
-        """Map world inputs (..., 54) to their latents (..., 2 z)."""
+        """Map world inputs (..., 54) to latents (..., 2 z)."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         return self.encoder(torch.cat([encoded[..., part] for part in POSES], -1))
 
@@ -155,9 +154,9 @@ class VAEHMD(WindowlessModel):
         return self.normalizer.posed(self.decoder(self.encode(seen).chunk(2, -1)[0]), seen), state
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call: each window is decoded either from its true poses or from its trackers.
+        """Decode each window either from its true poses or from its trackers; see MotionModel.
 
-        The one further loss is the latents' KL divergence; see MotionModel.
+        The additional loss is the latents' KL divergence.
         """
         posed = (distributed.draw_rows(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
         of_pose = self.pose_encoder(self.normalizer.encode(true_frames)[..., SPARSE_DIM:])

@@ -1,4 +1,4 @@
-"""The VQ-VAE whose frozen encoder and codebook give the memory its code-vectors (App. A, reading 5).
+"""The VQ-VAE that provides the memory's code-vectors (App. A; docs/readings.md, no. 5).
 
 It works frame by frame in network space: a frame [X | Theta] (252) is encoded, quantised, and decoded to the
 132 rotation components.
@@ -17,13 +17,13 @@ from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer, in_float32
 
 
-class Quantised(NamedTuple):
-    """What a codebook returns for latents in training.
+class QuantisedLatents(NamedTuple):
+    """A codebook's outputs for latents in training.
 
     Attributes:
         codes: code-vectors (..., width).
-        indices: their indices (...).
-        loss: the loss that ties encoder and codebook, a scalar.
+        indices: the code-vectors' indices (...).
+        loss: the codebook and commitment loss, a scalar.
     """
 
     codes: Tensor
@@ -31,18 +31,18 @@ class Quantised(NamedTuple):
     loss: Tensor
 
 
-def straight_through(latent: Tensor, codes: Tensor) -> Tensor:
-    """Return the codes (..., width); their gradient passes to the latents (..., width) unchanged."""
+def pass_gradients_through(latent: Tensor, codes: Tensor) -> Tensor:
+    """Return the codes (..., width) with a straight-through gradient to the latents (..., width)."""
     return latent + (codes - latent).detach()
 
 
 class Codebook(nn.Module):
-    """K code-vectors, of which the nearest one replaces a latent; subclasses say how they are learned."""
+    """K code-vectors; the nearest code-vector replaces a latent. Subclasses define how they are learned."""
 
     vectors: Tensor
 
     def find_indices(self, latent: Tensor) -> Tensor:
-        """Return the index (...) of the code-vector nearest to each latent (..., width), Euclidean."""
+        """Return the index (...) of the nearest code-vector (Euclidean) for each latent (..., width)."""
         with in_float32(latent.device):  # bfloat16 would make another code-vector the nearest
             products = latent.to(self.vectors.dtype) @ self.vectors.T
             return (self.vectors.square().sum(-1) - 2 * products).argmin(-1)
@@ -56,8 +56,8 @@ class Codebook(nn.Module):
 class EMACodebook(Codebook):
     """Code-vectors that are running means of the latents assigned to them.
 
-    The first batch initialises them. A code to which almost no latents are assigned any more is dead, and
-    starts again on a random latent of the batch.
+    The first batch initialises them. A code with almost no assigned latents is dead, and restarts at a random
+    latent of the batch.
 
     Args:
         codes: K, the number of code-vectors.
@@ -80,16 +80,16 @@ class EMACodebook(Codebook):
         self.register_buffer("counts", torch.zeros(codes))
         self.register_buffer("started", torch.zeros((), dtype=torch.bool))
 
-    def learn(self, latent: Tensor) -> Quantised:
+    def learn(self, latent: Tensor) -> QuantisedLatents:
         """Quantise latents (B, width) and move the code-vectors towards them."""
         with in_float32(latent.device):  # running means need float32
-            codes, index = self._follow(latent.detach().to(self.vectors.dtype))
-        return Quantised(codes, index, self.commitment * F.mse_loss(latent, codes))
+            codes, index = self._update_means(latent.detach().to(self.vectors.dtype))
+        return QuantisedLatents(codes, index, self.commitment * F.mse_loss(latent, codes))
 
-    def _follow(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+    def _update_means(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Return the codes and indices of latents (B, width), then update the code-vectors.
 
-        Where several processes share a batch, the running means are those of the whole batch.
+        If several processes share a batch, the running means cover the whole batch.
         """
         latent = distributed.gather_rows(latent)
         if not self.started:
@@ -104,7 +104,7 @@ class EMACodebook(Codebook):
         return distributed.take_local_rows(codes), distributed.take_local_rows(index)
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
-        """Replace the codes that are `dead` (K,) by random latents of the batch (B, width)."""
+        """Replace the codes in the mask `dead` (K,) by random latents of the batch (B, width)."""
         pick = torch.randint(len(latent), (len(dead),), device=latent.device)
         self.sums.copy_(torch.where(dead[:, None], latent[pick], self.sums))
         self.counts.copy_(torch.where(dead, torch.ones_like(self.counts), self.counts))
@@ -112,7 +112,7 @@ class EMACodebook(Codebook):
 
 
 class GradientCodebook(Codebook):
-    """Code-vectors that are parameters, learned by the codebook loss of van den Oord et al. 2017.
+    """Code-vectors as parameters, learned by the codebook loss of van den Oord et al. 2017.
 
     Args:
         codes: K, the number of code-vectors.
@@ -126,11 +126,11 @@ class GradientCodebook(Codebook):
         self.commitment = commitment
         self.vectors = nn.Parameter(torch.empty(codes, width).uniform_(-1 / codes, 1 / codes))
 
-    def learn(self, latent: Tensor) -> Quantised:
+    def learn(self, latent: Tensor) -> QuantisedLatents:
         """Quantise latents (B, width); the loss pulls codes to latents and latents to codes."""
         codes, index = self(latent)
         loss = F.mse_loss(codes, latent.detach()) + self.commitment * F.mse_loss(latent, codes.detach())
-        return Quantised(codes, index, loss)
+        return QuantisedLatents(codes, index, loss)
 
 
 LearnedCodebook = EMACodebook | GradientCodebook
@@ -138,7 +138,7 @@ CODEBOOKS: dict[str, type[LearnedCodebook]] = {"ema": EMACodebook, "gradient": G
 
 
 class VQVAE(nn.Module):
-    """Encoder, codebook and decoder, which work on single frames.
+    """A VQ-VAE of single frames: encoder, codebook and decoder.
 
     Args:
         codes: K, the number of code-vectors.
@@ -162,34 +162,34 @@ class VQVAE(nn.Module):
     ):
         super().__init__()
         self.width = width
-        self.encoder = nn.Sequential(nn.Linear(FRAME_DIM, width), *_blocks(width, encoder_depth))
+        self.encoder = nn.Sequential(nn.Linear(FRAME_DIM, width), *_make_blocks(width, encoder_depth))
         self.codebook: LearnedCodebook = CODEBOOKS[codebook](codes, width, commitment, decay)
-        self.decoder = nn.Sequential(*_blocks(width, decoder_depth), nn.Linear(width, ROTATION.stop))
+        self.decoder = nn.Sequential(*_make_blocks(width, decoder_depth), nn.Linear(width, ROTATION.stop))
 
     def encode(self, frames: Tensor) -> Tensor:
         """Encode frames (..., 252) in network space to latents (..., width).
 
-        They are computed in float32 in a mixed-precision training, too: rounded latents have other
-        code-vectors than those that evaluation and export find.
+        The latents are always computed in float32: in lower precision, training would find other code-vectors
+        than evaluation and export.
         """
         with in_float32(frames.device):
             return self.encoder(frames.to(self.codebook.vectors.dtype))
 
-    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+    def compute_code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return the code-vectors (..., width) of inputs (..., 54) and motion (..., 198) in network space."""
         return self.codebook(self.encode(torch.cat([sparse, motion], -1)))[0]
 
-    def reconstruct(self, frames: Tensor) -> tuple[Tensor, Quantised]:
+    def reconstruct(self, frames: Tensor) -> tuple[Tensor, QuantisedLatents]:
         """Reconstruct the rotations (B, 132) of frames (B, 252), with the straight-through gradient.
 
         An EMA codebook learns from this call.
         """
         latent = self.encode(frames)
-        quantised: Quantised = self.codebook.learn(latent)
-        return self.decoder(straight_through(latent, quantised.codes)), quantised
+        quantised: QuantisedLatents = self.codebook.learn(latent)
+        return self.decoder(pass_gradients_through(latent, quantised.codes)), quantised
 
     def compute_losses(self, frames: Tensor, normalizer: Normalizer) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the losses by name (Eq. 1 and the codebook's), and the chosen indices (B,).
+        """Return the losses by name (Eq. 1 and the codebook loss), and the chosen indices (B,).
 
         An EMA codebook learns from this call.
 
@@ -211,6 +211,6 @@ def measure_rotation_error(rotations: Tensor, frames: Tensor, normalizer: Normal
     return error.abs().sum(-1).mean()
 
 
-def _blocks(width: int, depth: int) -> list[nn.Module]:
+def _make_blocks(width: int, depth: int) -> list[nn.Module]:
     """Make `depth` blocks of LayerNorm, Linear and SiLU (App. A)."""
     return [nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU()) for _ in range(depth)]

@@ -1,8 +1,8 @@
 """The training loop of VQ-VAEs and motion networks: steps, checkpoints, validation, log.
 
-A step's randomness only depends on (seed, step). A run that was killed and resumed ends in the same weights,
-bit for bit on a CPU, as one that was not. Several processes may train one run together
-(memmlp.common.distributed); the first of them writes.
+A step's randomness only depends on (seed, step). A run that was killed and resumed ends with the same weights
+as an uninterrupted run, bit for bit on a CPU. Several processes may train one run together
+(memmlp.common.distributed). Only the first process writes files.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from memmlp.training.optim import Average, Optim
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a training step computes.
+    """The results of a training step.
 
     Attributes:
         loss: the loss, a scalar.
         terms: the loss's unweighted terms by name.
-        clips: indices of the clips (B,) that the batch came from.
+        clips: clip index of each sample (B,).
     """
 
     loss: Tensor
@@ -41,11 +41,11 @@ class StepResult:
 
 
 class TrainingTask:
-    """What the loop trains: a module with a loss and data.
+    """A task for the training loop: a module with a loss and data.
 
     Attributes:
-        module: the module whose parameters and buffers a checkpoint must hold.
-        dataset: the training part of the dataset.
+        module: the module to train; checkpoints hold its parameters and buffers.
+        dataset: the training split of the dataset.
     """
 
     module: nn.Module
@@ -60,11 +60,11 @@ class TrainingTask:
         raise NotImplementedError
 
     def report(self) -> dict[str, float]:
-        """Return values to log besides the loss terms; by default none."""
+        """Return further values to log besides the loss terms; by default an empty dict."""
         return {}
 
     def validate(self) -> dict[str, float]:
-        """Compute the metrics on the validation part."""
+        """Compute the metrics on the validation split."""
         raise NotImplementedError
 
 
@@ -85,22 +85,22 @@ def train(
     description: str,
     on_validation: ValidationCallback | None = None,
 ) -> None:
-    """Train to `optim.steps`, starting from the run's checkpoint if there is one.
+    """Train until step `optim.steps`, starting from the run's checkpoint if there is one.
 
-    The last checkpoint stays in the run's folder. The module is left with the weights that count, which may
-    be an average over steps.
+    The last checkpoint stays in the run's folder. The module is left with the final weights, which may be an
+    average over steps.
 
     Args:
         task: what to train.
         optim: steps, learning rates and intervals.
-        run: the run whose folder takes checkpoints and the metrics log.
+        run: the run; its folder receives checkpoints and the metrics log.
         seed: the seed of all steps.
         description: label of the progress bar.
         on_validation: called after each validation; see ValidationCallback.
 
     Raises:
         TrainingDiverged: if the loss is NaN or infinite.
-        InputError: if several processes cannot train the task with the same result as one.
+        InputError: if several processes would not give the same result as one process.
     """
     check_processes(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
@@ -108,7 +108,7 @@ def train(
     start, spent = resume(task, optimiser, average, run)
     started = time.monotonic() - spent
     if start and distributed.is_first():
-        notify(f"{description}: resumes at step {start} of {optim.steps}, the last checkpoint")
+        notify(f"{description}: resumes from the last checkpoint, at step {start} of {optim.steps}")
     distributed.copy_from_first(task.module)
     with show_progress(description, optim.steps, start, shown=distributed.is_first(), unit="steps") as count:
         for step in range(start, optim.steps):
@@ -123,21 +123,22 @@ def train(
                 on_validation(step + 1, validation)
     if distributed.is_first():
         run.record_seconds("train", time.monotonic() - started)
-    average.put_in_place()
+    average.write_into_module()
 
 
 def check_processes(task: TrainingTask, optim: Optim, description: str) -> None:
-    """Raise InputError if a batch shared by several processes does not give the same step as on one."""
+    """Raise InputError if several processes cannot share a batch with the same result as one process."""
     count = distributed.world_size()
     if optim.batch % count:
         raise InputError(
-            f"{description}: optim.batch or vqvae.batch={optim.batch}: must be a multiple of {count}, "
-            "the number of processes"
+            f"optim.batch or vqvae.batch={optim.batch}: must be a multiple of the number of processes, "
+            f"{count} ({description})"
         )
-    if count > 1 and (names := layers.find_batch_dependent(task.module)):
+    if count > 1 and (names := layers.find_batch_dependent_layers(task.module)):
         raise InputError(
-            f"{description}: {', '.join(names)} on {count} processes: each process would draw or count by "
-            "itself; use layers that work row by row, and memmlp.networks.layers.Dropout"
+            f"{description}: must not use {', '.join(names)} with {count} processes, since each would "
+            "draw or count separately; use layers that treat rows separately, and "
+            "memmlp.networks.layers.Dropout"
         )
 
 
@@ -163,7 +164,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
 
 
 def gather_batch(result: StepResult) -> StepResult:
-    """Return the mean loss and terms, and all clips, of a batch that several processes may share."""
+    """Average loss and terms of a batch over the processes that share it, and gather its clips."""
     if not distributed.is_batch_split():
         return result
     terms = torch.stack([result.loss, *result.terms.values()])
@@ -194,7 +195,7 @@ def record(
     result: StepResult,
     count: ProgressCounter,
 ) -> dict[str, float]:
-    """Log and show a finished step; return the values of a validation, or nothing where none was due."""
+    """Log and show a finished step; return the validation's values, or {} without a validation."""
     last = step == optim.steps
     if step % optim.log_every == 0 or last:
         loss = float(result.loss.detach())
@@ -210,9 +211,9 @@ def record(
 
 
 def validate(task: TrainingTask, average: Average) -> dict[str, float]:
-    """Validate the weights that count, and return the task's values."""
+    """Validate the final weights (see Average), and return the task's values."""
     task.module.eval()
-    with average.in_place(), label_progress("validation"):
+    with average.using_average(), label_progress("validation"):
         return task.validate()
 
 
@@ -224,15 +225,17 @@ def save(
     step: int,
     seconds: float,
 ) -> None:
-    """Write a checkpoint from which another process can resume after `step` steps, which took `seconds`.
+    """Write a checkpoint after `step` steps and `seconds` of training.
 
-    Of several processes the first one writes, and the others continue with its weights.
+    The first process writes it; other processes continue with the first one's weights.
     """
     distributed.copy_from_first(task.module)
     if not distributed.is_first():
         return
     rates = [group["initial_lr"] for group in optimiser.param_groups]
-    tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
+    tensors = checkpoint.collect_module_tensors("module", task.module) | checkpoint.collect_optimiser_tensors(
+        optimiser
+    )
     tensors |= average.tensors()
     tensors["rng.torch"] = torch.get_rng_state()
     checkpoint.write(run.checkpoint, tensors, {"step": step, "initial_lr": rates, "seconds": seconds})
@@ -241,7 +244,7 @@ def save(
 def resume(
     task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run
 ) -> tuple[int, float]:
-    """Load the run's checkpoint, if any; return the number of finished steps and the seconds they took."""
+    """Load the run's checkpoint if there is one; return the numbers of finished steps and of seconds."""
     found = checkpoint.read(run.checkpoint) if distributed.is_first() and run.checkpoint.exists() else None
     found = distributed.broadcast(found)
     if found is None:

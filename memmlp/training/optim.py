@@ -1,4 +1,4 @@
-"""How a module is optimised: optimiser, steps, batches, learning rates, precision, averaged weights.
+"""The optimisation of a module: optimiser, steps, batches, learning rates, precision, averaged weights.
 
 The classes of the slot `optim` are Optim (AdamW), Muon and ScheduleFree.
 """
@@ -30,8 +30,8 @@ SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     "milestones": lambda done, final, drop_at: 0.2 ** sum(done >= at for at in (0.2, 0.5, 0.7)),
 }
 
-PRODUCTS = {torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__, torch.mm, torch.addmm}
-"""The products of matrices that are computed in float32 where bfloat16 is slow."""
+MATRIX_PRODUCTS = {torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__, torch.mm, torch.addmm}
+"""The matrix products that are computed in float32 where bfloat16 is slow."""
 
 
 @dataclass
@@ -52,7 +52,7 @@ class OptimSettings(Settings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield which values cannot be combined; see Settings."""
+        """Yield invalid combinations of values; see Settings."""
         own = config["optim"]
         if own.get("final_lr", 0) > own["lr"]:
             yield f"optim.final_lr={own['final_lr']}: must be at most optim.lr={own['lr']}"
@@ -63,7 +63,7 @@ class OptimSettings(Settings):
 @component("optim", "adamw", builds="Optim")
 @dataclass
 class AdamWSettings(OptimSettings):
-    """Training by AdamW (Sec. 4.1). Batch and weight decay are AGRoL's (reading 12)."""
+    """Training by AdamW (Sec. 4.1). Batch size and weight decay are AGRoL's (docs/readings.md, no. 12)."""
 
     final_lr: float = setting(at_least(0), "${profile.final_lr}")  # the learning rate at the end
     # step: falls to final_lr at drop_at; cosine: falls to it along a half cosine
@@ -77,7 +77,7 @@ class AdamWSettings(OptimSettings):
 @component("optim", "muon", builds="Muon")
 @dataclass
 class MuonSettings(AdamWSettings):
-    """Training by Muon for matrices and AdamW for all else (torch.optim.Muon).
+    """Training by Muon for matrices and by AdamW for all other parameters (torch.optim.Muon).
 
     Its steps are as long as AdamW's at the same learning rate.
     """
@@ -100,15 +100,15 @@ class ScheduleFreeSettings(OptimSettings):
 
 @dataclass(frozen=True)
 class Optim:
-    """How a module is optimised: by AdamW, unless a subclass says otherwise.
+    """The optimisation of a module: by AdamW, or by the optimiser of a subclass.
 
-    The attributes are the keys of AdamWSettings, except for these.
+    Attributes that are not listed are keys of AdamWSettings.
 
     Attributes:
         batch: windows per step; for a VQ-VAE, frames per step.
-        schedule: also "milestones", outside the config: times 0.2 at 20, 50 and 70 % of the steps (App. A).
+        schedule: a name in SCHEDULES; "milestones" is for VQ-VAEs (App. A).
         betas: Adam's two decay rates.
-        decoupled: whether weight decay is AdamW's; otherwise it is Adam's.
+        decoupled: whether weight decay is decoupled, as in AdamW.
     """
 
     steps: int
@@ -130,47 +130,46 @@ class Optim:
     log_every: int = 50
 
     def with_lr(self, lr: float | None) -> Self:
-        """Return this optimisation with another learning rate at the start, and the final one in proportion.
+        """Return a copy with another initial learning rate; the final rate is scaled by the same factor.
 
         Args:
-            lr: learning rate at the start; None to change nothing.
+            lr: initial learning rate; None changes nothing.
         """
         return self if lr is None else replace(self, lr=lr, final_lr=self.final_lr * lr / self.lr)
 
     def compute_factor(self, step: int) -> float:
-        """Return the learning rate at a step as a fraction of the learning rate at the start."""
+        """Return the learning rate at a step as a fraction of the initial learning rate."""
         course = SCHEDULES[self.schedule](step / self.steps, self.final_lr / self.lr, self.drop_at)
-        return self.warm(step) * course
+        return self.compute_warmup_factor(step) * course
 
-    def warm(self, step: int) -> float:
-        """Return the fraction of its learning rate that a step gets: less than 1 during the warm-up."""
+    def compute_warmup_factor(self, step: int) -> float:
+        """Return the warm-up's factor on the learning rate at a step, in (0, 1]."""
         return min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
 
     def check_installed(self) -> None:
         """Raise InputError if the optimiser's library is not installed."""
 
     def build(self, groups: list[dict]) -> Optimizer:
-        """Make the optimiser over parameter groups; a group's own `lr` and `weight_decay` take precedence."""
+        """Make the optimiser for parameter groups; a group's own `lr` and `weight_decay` take precedence."""
         return self.build_adam(groups)
 
     def build_adam(self, groups: list[dict]) -> Optimizer:
-        """Make Adam or AdamW over parameter groups."""
+        """Make Adam or AdamW for parameter groups."""
         kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
         return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
 
     def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
-        """Make the object that says which weights of the module count."""
+        """Make the object that provides the module's final weights."""
         return EMA(module, self.ema) if self.ema else Average(module)
 
 
 @dataclass(frozen=True)
 class Muon(Optim):
-    """Optimised by Muon for matrices, and by AdamW for all other parameters (Jordan et al. 2024).
+    """Optimisation by Muon for matrices, and by AdamW for all other parameters (Jordan et al. 2024).
 
-    Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025), so that AdamW's learning
-    rates and weight decay fit both. The implementation is torch.optim.Muon, which multiplies matrices in
-    bfloat16. Its momentum is Nesterov momentum. The attributes are the keys of
-    MuonSettings.
+    Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025). AdamW's learning rates
+    and weight decay therefore suit both. The implementation is torch.optim.Muon, which multiplies matrices in
+    bfloat16 and uses Nesterov momentum. The attributes are the keys of MuonSettings.
     """
 
     momentum: float = 0.95
@@ -178,21 +177,21 @@ class Muon(Optim):
     vectors: str = "adamw"
 
     def with_lr(self, lr: float | None) -> Self:
-        """Return these settings with another learning rate; `other_lr` is scaled by the same factor."""
+        """Return a copy with another learning rate; `other_lr` is scaled by the same factor."""
         other = super().with_lr(lr)
         if lr is None or self.other_lr is None:
             return other
         return replace(other, other_lr=self.other_lr * lr / self.lr)
 
     def check_installed(self) -> None:
-        """Raise InputError if torch has no Muon."""
+        """Raise InputError if torch does not have Muon."""
         if not hasattr(torch.optim, "Muon"):
-            raise InputError(f"optim=muon: torch {torch.__version__} does not have Muon; needs 2.9 or newer")
+            raise InputError(f"optim=muon: needs torch 2.9 or newer, not {torch.__version__}")
 
     def build(self, groups: list[dict]) -> Optimizer:
-        """Make both optimisers as one; see Optim."""
+        """Make one optimiser from Muon and AdamW; see Optim."""
         self.check_installed()
-        matrices, rest = _split(groups, least=1 if self.vectors == "muon" else 2)
+        matrices, rest = _split_matrices(groups, least=1 if self.vectors == "muon" else 2)
         parts: list[Optimizer] = []
         if matrices:
             keys = self.lr, self.weight_decay, self.momentum
@@ -204,18 +203,18 @@ class Muon(Optim):
 
 @dataclass(frozen=True)
 class ScheduleFree(Optim):
-    """Optimised by schedule-free AdamW (Defazio et al. 2024) of the package schedulefree.
+    """Optimisation by schedule-free AdamW (Defazio et al. 2024) of the package schedulefree.
 
-    It averages the weights itself and has no schedule but the warm-up: `schedule`, `final_lr`, `drop_at` and
-    `ema` have no effect.
+    It averages the weights itself, and its only schedule is the warm-up: `schedule`, `final_lr`, `drop_at`
+    and `ema` have no effect.
     """
 
     def compute_factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of `lr`."""
-        return self.warm(step)
+        return self.compute_warmup_factor(step)
 
     def check_installed(self) -> None:
-        """Raise InputError if the package is not installed."""
+        """Raise InputError if the package schedulefree is not installed."""
         if find_spec("schedulefree") is None:
             raise InputError(
                 "optim=schedule_free: needs the package schedulefree; pip install 'memmlp[schedulefree]'"
@@ -231,12 +230,12 @@ class ScheduleFree(Optim):
         return optimiser
 
     def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
-        """Make the object that says which weights count: the optimiser's own average."""
+        """Make the object that provides the final weights: the optimiser's own average."""
         return ScheduleFreeAverage(module, optimiser)
 
 
-def _split(groups: list[dict], least: int) -> tuple[list[dict], list[dict]]:
-    """Divide parameter groups into matrices of at least `least` rows and columns, and all others."""
+def _split_matrices(groups: list[dict], least: int) -> tuple[list[dict], list[dict]]:
+    """Divide parameter groups into matrices with at least `least` rows and columns, and other parameters."""
     parts: tuple[list[dict], list[dict]] = ([], [])
     for group in groups:
         for chosen, matrices in zip(parts, (True, False), strict=True):
@@ -245,8 +244,8 @@ def _split(groups: list[dict], least: int) -> tuple[list[dict], list[dict]]:
     return parts
 
 
-def vqvae_optim(steps: int, **keys: Any) -> Optim:
-    """Return a VQ-VAE's optimisation: Adam, its rate times 0.2 at 20, 50 and 70 % of the steps (App. A).
+def make_vqvae_optim(steps: int, **keys: Any) -> Optim:
+    """Make a VQ-VAE's optimisation: Adam; its rate is multiplied by 0.2 at 20, 50 and 70 % of the steps.
 
     Validation is done once, at the end; `keys` are further attributes of Optim.
     """
@@ -256,18 +255,18 @@ def vqvae_optim(steps: int, **keys: Any) -> Optim:
 
 
 class ComposedOptimiser(Optimizer):
-    """Several optimisers as one, with the parameter groups and the state of all of them.
+    """One optimiser made of several, with all their parameter groups and states.
 
     Args:
-        parts: the optimisers, which have no parameter in common.
+        parts: the optimisers; they must not share parameters.
     """
 
     def __init__(self, parts: Sequence[Optimizer]):
         self.parts = tuple(parts)
         super().__init__([group for part in parts for group in part.param_groups], {})
-        self._share()
+        self._share_groups()
 
-    def _share(self) -> None:
+    def _share_groups(self) -> None:
         start = 0
         for part in self.parts:  # each uses the groups and the state themselves, not copies
             end = start + len(part.param_groups)
@@ -277,21 +276,21 @@ class ComposedOptimiser(Optimizer):
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
         """Take a step of each part; a closure is not supported."""
-        with widen_products():
+        with multiply_in_float32():
             for part in self.parts:
                 part.step()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Load the groups and the state of all parts."""
         super().load_state_dict(state_dict)
-        self._share()
+        self._share_groups()
 
 
-class WideProducts(TorchFunctionMode):
-    """Within it, products of bfloat16 matrices on the CPU are computed in float32 and rounded.
+class Float32Products(TorchFunctionMode):
+    """A context that computes products of bfloat16 matrices on the CPU in float32, then rounds them.
 
-    A processor without instructions for bfloat16 is six times slower at them than at float32. Products of two
-    bfloat16 numbers are exact in float32, and sums are in float32, so the result is that of the instructions.
+    A processor without bfloat16 instructions is six times slower in bfloat16 than in float32. The results are
+    equal: products of two bfloat16 numbers are exact in float32, and sums are in float32 with both methods.
     """
 
     def __torch_function__(
@@ -302,34 +301,34 @@ class WideProducts(TorchFunctionMode):
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:
         """Call a function of torch."""
-        if func in PRODUCTS and all(map(_is_narrow, args)):
+        if func in MATRIX_PRODUCTS and all(map(_is_bfloat16_on_cpu, args)):
             return func(*(tensor.float() for tensor in args), **(kwargs or {})).bfloat16()
         return func(*args, **(kwargs or {}))
 
 
-def widen_products() -> AbstractContextManager[object]:
-    """Return `WideProducts` on a processor without instructions for bfloat16, and nothing on others."""
-    return nullcontext() if has_bfloat16_products() else WideProducts()
+def multiply_in_float32() -> AbstractContextManager[object]:
+    """Return `Float32Products` on a processor without bfloat16 instructions, otherwise an empty context."""
+    return nullcontext() if has_bfloat16_products() else Float32Products()
 
 
 @functools.cache
 def has_bfloat16_products() -> bool:
-    """Return whether this processor has instructions for products of bfloat16; only x86 is asked."""
+    """Return whether this processor has bfloat16 instructions; processors other than x86 are not checked."""
     ask: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # newer than some torch
     known = ask()
     return known.get("architecture") != "x86_64" or bool(known.get("avx512_bf16") or known.get("amx_bf16"))
 
 
-def _is_narrow(tensor: Any) -> bool:
+def _is_bfloat16_on_cpu(tensor: Any) -> bool:
     return isinstance(tensor, Tensor) and tensor.dtype == torch.bfloat16 and tensor.device.type == "cpu"
 
 
 class Average:
-    """The weights of a module that count: they are validated, and kept at the end.
+    """The final weights of a module, which are validated and kept after the training.
 
-    In this base class they are the weights of the last step; a subclass may average over the steps. A
-    checkpoint has both, so that a resumed training continues as if it had never stopped. Only parameters are
-    averaged; buffers, such as a codebook's statistics, are the last step's.
+    In this base class the weights of the last step are the final weights; a subclass may average over the
+    steps. A checkpoint holds both, so a resumed training continues exactly. Only parameters are averaged.
+    Buffers, such as a codebook's statistics, keep the last step's values.
 
     Args:
         module: the module that is trained.
@@ -341,28 +340,28 @@ class Average:
     def update(self, steps: int) -> None:
         """Update the average with the module's weights after `steps` steps."""
 
-    def put_in_place(self) -> None:
-        """Put the weights that count into the module, for good."""
+    def write_into_module(self) -> None:
+        """Write the final weights into the module."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors that a checkpoint must hold, their names preceded by "average."."""
+        """Return the tensors for a checkpoint; each name begins with "average."."""
         return {}
 
     def load(self, tensors: dict[str, Tensor]) -> None:
-        """Load from a checkpoint's tensors those that `tensors` returned."""
+        """Restore the average from a checkpoint's tensors, which include the result of `tensors`."""
 
     @contextmanager
-    def in_place(self) -> Iterator[None]:
-        """Give the module the weights that count within the context, then the last step's, bit for bit."""
+    def using_average(self) -> Iterator[None]:
+        """Use the final weights within the context, then restore the last step's weights bit for bit."""
         before = {name: one.detach().clone() for name, one in self.parameters.items()}
-        self.put_in_place()
+        self.write_into_module()
         try:
             yield
         finally:
-            self._put(before)
+            self._write_parameters(before)
 
     @torch.no_grad()
-    def _put(self, values: dict[str, Tensor]) -> None:
+    def _write_parameters(self, values: dict[str, Tensor]) -> None:
         for name, one in self.parameters.items():
             one.copy_(values[name])
 
@@ -370,12 +369,12 @@ class Average:
 class EMA(Average):
     """An exponential moving average of the weights.
 
-    The decay grows to its value as (1 + steps) / (10 + steps), so that the random first weights are soon
+    The decay first grows as (1 + steps) / (10 + steps), so that the random initial weights are soon
     forgotten.
 
     Args:
         module: the module that is trained.
-        decay: the share of the old average that is kept at each step, in (0, 1).
+        decay: the fraction of the old average that each step keeps, in (0, 1).
     """
 
     def __init__(self, module: nn.Module, decay: float):
@@ -388,8 +387,8 @@ class EMA(Average):
         weights = [one.detach() for one in self.parameters.values()]
         get_ema_multi_avg_fn(decay)(list(self.averages.values()), weights, steps)
 
-    def put_in_place(self) -> None:
-        self._put(self.averages)
+    def write_into_module(self) -> None:
+        self._write_parameters(self.averages)
 
     def tensors(self) -> dict[str, Tensor]:
         return {f"average.{name}": value for name, value in self.averages.items()}
@@ -400,7 +399,7 @@ class EMA(Average):
 
 
 class ScheduleFreeAverage(Average):
-    """The average that a schedule-free optimiser maintains itself, and shows in its evaluation mode.
+    """The average that a schedule-free optimiser maintains; its evaluation mode writes it into the module.
 
     Args:
         module: the module that is trained.
@@ -408,19 +407,19 @@ class ScheduleFreeAverage(Average):
     """
 
     COUNTERS = ("k", "weight_sum", "lr_max")
-    """What its groups count besides their settings: steps, sum of the average's weights, largest rate."""
+    """The counters in the optimiser's groups: steps, sum of the average's weights, largest learning rate."""
 
     def __init__(self, module: nn.Module, optimiser: Optimizer):
         super().__init__(module)
         self.optimiser = optimiser
 
-    def put_in_place(self) -> None:
+    def write_into_module(self) -> None:
         self.optimiser.eval()  # type: ignore[attr-defined]
 
     @contextmanager
-    def in_place(self) -> Iterator[None]:
+    def using_average(self) -> Iterator[None]:
         # The optimiser can restore the last step's weights by itself, but not bit for bit.
-        with super().in_place():
+        with super().using_average():
             yield
             self.optimiser.train()  # type: ignore[attr-defined]
 

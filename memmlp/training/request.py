@@ -1,6 +1,6 @@
-"""What a composed config asks for: its runs and their stages by id, and the results if they exist.
+"""The request of a composed config: the ids of its runs and stages, and existing results.
 
-This module needs no torch, so that planning a sweep, listing, and finding a finished run are quick.
+This module does not import torch, so planning a sweep and finding finished runs are fast.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from memmlp.runs.evaluation_file import read_report
 from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, Identity, compute_deployment_id, compute_evaluation_id
 from memmlp.runs.run import Run
 
-SLOW = 0.99  # of the network's rate; 59.94 Hz counts as 60
+LOW_RATE = 0.99  # of the network's rate; 59.94 Hz counts as 60
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """A run that a config asks for, with the runs that it builds upon and the stages after its training.
+    """A run requested by a config, with its prerequisite runs and the stages after its training.
 
     Attributes:
         config: the resolved config.
@@ -46,7 +46,7 @@ class RunRequest:
 
     @property
     def evaluations(self) -> dict[str, str]:
-        """The id of the evaluation, by mode."""
+        """The evaluation ids by mode."""
         groups = self.motion.groups_digest
         return {
             mode: compute_evaluation_id(self.config, mode, groups)
@@ -64,9 +64,9 @@ class RunRequest:
         return (*self.evaluations.values(), *([self.deployment_id] if self.deployment_id else []))
 
     def identities(self, data_digest: str) -> list[Identity]:
-        """Return the identities of the runs that are needed, in order, the network's own run last."""
+        """Return the identities of the required runs in training order; the network's run is the last one."""
         found: list[Identity] = []
-        for kind, config in self._chain:
+        for kind, config in self._run_chain:
             found.append(Identity(kind, config, data_digest, found[-1] if found else None))
         return found
 
@@ -75,19 +75,19 @@ class RunRequest:
         return self.identities(data_digest)[-1]
 
     @cached_property
-    def _chain(self) -> list[tuple[str, dict[str, Any]]]:
-        """The runs that are needed, in order: their kinds, and the configs that determine their results.
+    def _run_chain(self) -> list[tuple[str, dict[str, Any]]]:
+        """The kind and the identifying config of each required run, in training order.
 
         The identity of a frozen VQ-VAE's run covers its config. A joint VQ-VAE is trained with the network:
         only the keys of its architecture have an effect.
         """
-        config, codes = self.config, codes_of(self.config)
+        config, codes = self.config, find_vqvae_training(self.config)
         own = {key: value for key, value in config.items() if key != "vqvae"}
         if codes == "joint":
             own["vqvae"] = {key: config["vqvae"][key] for key in VQVAE_SHAPE}
         if config["refiner"] is not None:
-            bare = without_refiner(config)
-            return [*RunRequest(bare, self.motion)._chain, (NETWORK, own)]
+            bare = remove_refiner(config)
+            return [*RunRequest(bare, self.motion)._run_chain, (NETWORK, own)]
         prerequisite: Any = find_chosen_settings(config, "prerequisite")
         if prerequisite is not None:
             return [*prerequisite.prerequisites(config), (NETWORK, own)]
@@ -98,13 +98,13 @@ class RunRequest:
         return [(NETWORK, own)]
 
 
-def codes_of(config: Mapping[str, Any]) -> str | None:
-    """Return how the VQ-VAE of a config's memory is trained, "frozen" or "joint"; None without one."""
+def find_vqvae_training(config: Mapping[str, Any]) -> str | None:
+    """Return the training of the memory's VQ-VAE, "frozen" or "joint"; None without a VQ-VAE."""
     return getattr(find_chosen_settings(config, "memory"), "codes", None) or None
 
 
-def without_refiner(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the config of the same network without its refiner, not forced and without saved predictions."""
+def remove_refiner(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the config without refiner, `force` and `save_predictions`."""
     return {**config, "refiner": None, "force": False, "save_predictions": None}
 
 
@@ -114,7 +114,7 @@ class Outcome:
 
     Attributes:
         run: the network's run.
-        made: the stages that this call made, out of "training", "evaluation" and "deployment".
+        made: the stages that this call ran, out of "training", "evaluation" and "deployment".
         results: mode -> branch -> metric, and "latency".
         stage_ids: the ids of the evaluations and the deployment that the results come from.
     """
@@ -125,32 +125,32 @@ class Outcome:
     stage_ids: tuple[str, ...]
 
 
-def finished_outcome(request: RunRequest) -> Outcome | None:
-    """Return the outcome of a request whose run and stages all exist; None if there is something to do."""
+def find_finished_outcome(request: RunRequest) -> Outcome | None:
+    """Return a request's outcome if its run and all stages exist; None if work remains."""
     if request.config["force"] or request.config["save_predictions"] or request.motion.digest() is None:
         return None
     data = request.motion.prepare()
     run = Run.from_id(request.outputs, request.identity(data.digest).id)
-    if not run.done or not all(map(run.has, request.stage_ids)) or unmeasured(request, run):
+    if not run.done or not all(map(run.has, request.stage_ids)) or list_missing_modes(request, run):
         return None
     announce_data(data)
     with run.lock():
         run.request_stages(request.stage_ids)
-    return Outcome(run, (), results_of(request, run), request.stage_ids)
+    return Outcome(run, (), read_results(request, run), request.stage_ids)
 
 
 def announce_data(data: Prepared) -> None:
-    """Print what the user should know of the data before a run begins."""
+    """Print facts and warnings about the data before a run begins."""
     clips = data.manifest.clips
-    announce(f"data: {len(clips)} clips ({tested_clips_remark(clips)}), prepared in {data.cache}")
-    for text in data_remarks(data):
+    announce(f"data: {len(clips)} clips ({describe_test_clips(clips)}), prepared in {data.cache}")
+    for text in list_data_remarks(data):
         notify(f"data: {text}")
 
 
-def unmeasured(request: RunRequest, run: Run) -> list[str]:
-    """Return the modes without an evaluation, or with one by other code of the user's own metrics.
+def list_missing_modes(request: RunRequest, run: Run) -> list[str]:
+    """Return the modes to evaluate, including modes measured by other code of custom metrics.
 
-    A package's code may change without a new component version; then its metrics are measured again.
+    A package's code may change without a new component version. Its metrics are then measured again.
     """
     return [
         mode
@@ -162,26 +162,26 @@ def unmeasured(request: RunRequest, run: Run) -> list[str]:
 def _measured_by_other_code(request: RunRequest, report: Mapping[str, Any]) -> bool:
     if not (report.get("settings") or {}).get("metrics"):
         return False
-    before, now = report.get("plugins") or {}, own_code(request).get("plugins", {})
+    before, now = report.get("plugins") or {}, describe_user_code(request).get("plugins", {})
     return any(before[name]["digest"] != now[name]["digest"] for name in before.keys() & now.keys())
 
 
-def own_code(request: RunRequest) -> dict[str, Any]:
-    """Return version and digest of the user's packages that the config uses; empty if it uses none."""
+def describe_user_code(request: RunRequest) -> dict[str, Any]:
+    """Return version and digest of the user's packages that the config uses; empty without such packages."""
     packages = request.config.get("plugins")
     return {"plugins": describe_user_packages(packages)} if packages else {}
 
 
-def results_of(request: RunRequest, run: Run) -> dict[str, Any]:
-    """Return the results that the request asks for: mode -> branch -> metric, and "latency"."""
+def read_results(request: RunRequest, run: Run) -> dict[str, Any]:
+    """Return the requested results: mode -> branch -> metric, and "latency"."""
     files = {mode: run.evaluation(name) for mode, name in request.evaluations.items() if run.has(name)}
     means = {mode: read_report(path)["mean"] for mode, path in files.items()}
     record = run.deployment(request.deployment_id).record if request.deployment_id else {}
     return means | ({"latency": record} if record else {})
 
 
-def clip_rows(request: RunRequest, run: Run) -> list[dict[str, Any]]:
-    """Return name, frames and the wanted metrics, by mode and branch, for each test clip."""
+def read_clip_rows(request: RunRequest, run: Run) -> list[dict[str, Any]]:
+    """Return a row for each test clip: name, frames, and the requested metrics by mode and branch."""
     rows: dict[str, dict[str, Any]] = {}
     for mode, name in request.evaluations.items():
         for clip in read_report(run.evaluation(name))["clips"]:
@@ -191,21 +191,21 @@ def clip_rows(request: RunRequest, run: Run) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def data_remarks(data: Prepared) -> list[str]:
-    """Return what the user should know of the data before a run begins."""
+def list_data_remarks(data: Prepared) -> list[str]:
+    """Return the warnings about the data to print before a run begins."""
     manifest = data.manifest
     found = (
-        skipped_remark(manifest.skipped),
-        unusual_remark(manifest.unusual),
-        low_rates_remark(manifest, manifest.clips, "clips"),
+        describe_skipped_files(manifest.skipped),
+        describe_unusual_clips(manifest.unusual),
+        describe_low_rates(manifest, manifest.clips, "clips"),
         divided_remark(manifest),
         unmatched_patterns_remark(manifest.split, [clip.name for clip in manifest.clips]),
     )
     return list(filter(None, found))
 
 
-def tested_clips_remark(clips: Sequence[ClipRecord]) -> str:
-    """Say how many test clips and groups there are, and whether they are too few for conclusions."""
+def describe_test_clips(clips: Sequence[ClipRecord]) -> str:
+    """Return the numbers of test clips and groups, with a hint if they are too low for conclusions."""
     tested = [clip.group for clip in clips if clip.split == "test"]
     counts = f"test clips: {len(tested)}, in groups: {len(set(tested))}"
     if len(set(tested)) > 1:
@@ -213,35 +213,37 @@ def tested_clips_remark(clips: Sequence[ClipRecord]) -> str:
     return f"{counts}, too few to compare networks; use more motion or a larger data.split.test"
 
 
-def low_rates_remark(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
-    """Return a remark on clips with a low frame rate that were interpolated linearly; None without any.
+def describe_low_rates(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
+    """Return a remark on linearly interpolated clips with a low frame rate; None without such clips.
 
     Linear interpolation makes kinks in the motion.
 
     Args:
         manifest: the data's manifest.
-        clips: some or all of its clips.
-        what: their name in the plural.
+        clips: the clips to check.
+        what: the name of the clips in the remark, such as "test clips".
     """
-    rates = sorted(clip.fps for clip in clips if clip.fps < SLOW * FPS)
+    rates = sorted(clip.fps for clip in clips if clip.fps < LOW_RATE * FPS)
     if not rates or manifest.interpolation != LINES:
         return None
     hertz = f"{rates[0]:g}" + (f" to {rates[-1]:g}" if rates[-1] > rates[0] else "")
     slow = f"{len(rates)} of {len(clips)} {what} were recorded at {hertz} Hz"
-    return f"{slow} and are interpolated linearly (data.interpolation): the kinks enter Jitter and velocities"
+    return (
+        f"{slow} and were interpolated linearly (data.interpolation), which raises Jitter and velocity errors"
+    )
 
 
-def skipped_remark(skipped: Sequence[Skipped]) -> str | None:
-    """Return a remark on skipped files; None without any."""
+def describe_skipped_files(skipped: Sequence[Skipped]) -> str | None:
+    """Return a remark on skipped files; None without skipped files."""
     if not skipped:
         return None
     files = "1 file was" if len(skipped) == 1 else f"{len(skipped)} files were"
     first = skipped[0]
-    return f"{files} skipped, first {first.file} ({first.reason}); data.strict=true stops there"
+    return f"{files} skipped, first {first.file} ({first.reason}); data.strict=true makes this an error"
 
 
-def unusual_remark(unusual: Mapping[str, str]) -> str | None:
-    """Return a remark on clips that are unusual but may be correct (name -> why); None without any."""
+def describe_unusual_clips(unusual: Mapping[str, str]) -> str | None:
+    """Return a remark on unusual clips, given by name and reason; None without unusual clips."""
     if not unusual:
         return None
     clips = "1 clip is" if len(unusual) == 1 else f"{len(unusual)} clips are"
@@ -250,27 +252,27 @@ def unusual_remark(unusual: Mapping[str, str]) -> str | None:
     return f"{clips} unusual, first {names}; details: memmlp data inspect"
 
 
-def data_warnings(config: Mapping[str, Any], data: Prepared) -> dict[str, Any]:
-    """Return warnings about a run's data for tables to flag, in words; None for each that does not apply.
+def collect_data_warnings(config: Mapping[str, Any], data: Prepared) -> dict[str, Any]:
+    """Return warnings about a run's data by name, for tables; None where a warning does not apply.
 
     Args:
         config: the run's config.
-        data: its prepared data.
+        data: the run's prepared data.
     """
     manifest = data.manifest
     tested = [clip for clip in manifest.clips if clip.split == "test"]
     names = [clip.name for clip in tested if clip.name in manifest.unusual]
     odd = [f"{name} ({manifest.unusual[name]})" for name in names]
     return {
-        "partial": partial_words(config, data),
+        "partial": describe_missing_data(config, data),
         "divided": divided_remark(manifest) or None,
-        "resampled": low_rates_remark(manifest, tested, "test clips"),
+        "resampled": describe_low_rates(manifest, tested, "test clips"),
         "unusual": f"{len(odd)} of {len(tested)} test clips are unusual, first {odd[0]}" if odd else None,
     }
 
 
-def partial_words(config: Mapping[str, Any], data: Prepared) -> str | None:
-    """Describe what the data lacks of its protocol or of its training clips; None if it is complete."""
+def describe_missing_data(config: Mapping[str, Any], data: Prepared) -> str | None:
+    """Describe missing data of the protocol or of the training groups; None if the data is complete."""
     own, manifest = config["data"], data.manifest
     coverage, found = manifest.coverage, manifest.listed or (*manifest.left_out, *manifest.groups)
     fraction = own["split"].get("train_fraction", 1)

@@ -1,7 +1,7 @@
-"""The rollout slot: draws the training batch of a step, and makes the history that it sees.
+"""The rollout slot: draws a step's training batch, and provides the history that the network sees.
 
-A network that is only trained on true history comes to rely on it, but lacks it at run time (exposure bias).
-So the history may be made by the network itself, as it will be in a live stream.
+A network that is trained only on true history learns to rely on it, but does not have it at run time
+(exposure bias). A rollout can therefore let the network predict its own history, as in a live stream.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from memmlp.networks.motion_model import MotionModel, State
 
 
 class TrainingCall(NamedTuple):
-    """The arguments of `MotionModel.training_call`, which should return the true motion.
+    """The arguments of `MotionModel.training_call` for one training step.
 
     Attributes:
         sparse: world inputs (B, n, 54) of the new frames.
         state: the state before the new frames.
         true_frames: world frames [X | Theta] (B, T, 252) of the window.
-        clips: indices of the clips (B,) that the frames are from.
+        clips: clip index of each sample (B,).
     """
 
     sparse: Tensor
@@ -39,20 +39,20 @@ class TrainingCall(NamedTuple):
 class Rollout(nn.Module):
     """The rollout slot's interface.
 
-    Where several processes share a batch, each draws the call for its own rows (memmlp.common.distributed).
+    If several processes share a batch, each process draws only its own rows (memmlp.common.distributed).
     """
 
     def begin(self, model: MotionModel) -> None:
-        """Make room for what is kept between a network's training steps; by default nothing is kept."""
+        """Prepare buffers that stay between a network's training steps; by default there are no buffers."""
 
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
-        """Draw the training call of a step."""
+        """Draw the batch of a training step, with the state before it."""
         raise NotImplementedError
 
     def keep(self, state: State) -> None:
-        """Keep what is needed of the state after the training call; by default nothing is kept."""
+        """Store the state after a training step for later steps; by default nothing is stored."""
 
 
 @component("rollout", "teacher_forcing")
@@ -72,9 +72,9 @@ class TeacherForcing(Rollout):
 @component("rollout", "own_predictions", builds="OwnPredictions")
 @dataclass
 class OwnPredictionsSettings(Settings):
-    """Training on the network's own predictions for the frames before the window (reading 6).
+    """Training on the network's own predictions for the frames before the window (docs/readings.md, no. 6).
 
-    With memory.shift=frame a call makes one of them, so that max_passes has to be model.frames at least.
+    With memory.shift=frame a call predicts only one frame, so max_passes must be at least model.frames.
     """
 
     # a step makes 0 to this many calls without gradient before the trained one; the number is drawn for each
@@ -83,10 +83,10 @@ class OwnPredictionsSettings(Settings):
 
 
 class OwnPredictions(Rollout):
-    """A rollout with the network's own history, made by 0 to `max_passes` calls without gradients beforehand.
+    """A rollout with predicted history, from 0 to `max_passes` earlier calls without gradients.
 
-    The first of these calls sees an empty history, of which each call fills one stride. All samples of a step
-    take the same number of calls.
+    The first call sees an empty history. Each call fills one stride of the history. All samples of a step use
+    the same number of calls.
     """
 
     def __init__(self, max_passes: int):
@@ -96,7 +96,7 @@ class OwnPredictions(Rollout):
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
-        """Draw the training call of a step, after the calls that make its history."""
+        """Draw the batch of a training step, and predict its history."""
         clips, end = map(distributed.take_local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
@@ -116,18 +116,18 @@ class OwnPredictions(Rollout):
 @component("rollout", "streams", version=2, builds="PersistentStreams")
 @dataclass
 class StreamsSettings(Settings):
-    """Training on persistent streams (reading 6)."""
+    """Training on persistent streams (docs/readings.md, no. 6)."""
 
     # streams side by side, each of which goes through whole clips on its own history
     streams: int = setting(at_least(1), tiny=16, small=1024, paper=1024)
 
 
 class PersistentStreams(Rollout):
-    """Many streams that run through the clips during the whole training, each on its own history.
+    """A rollout with many streams, which run through the clips during the whole training.
 
-    Every step moves the next `batch` streams on by one stride. A stream begins somewhere in a clip; when it
-    reaches the clip's end, it starts afresh at the beginning of another clip, so that every window is seen as
-    often as the sampler says. The streams' states are part of the checkpoint.
+    Every stream predicts its own history. Every step advances the next `batch` streams by one stride. A
+    stream starts at a random frame of a clip. At the clip's end it restarts at the beginning of another clip,
+    which preserves the sampler's window frequencies. The streams' states are part of the checkpoint.
 
     Args:
         streams: number of streams.
@@ -150,14 +150,14 @@ class PersistentStreams(Rollout):
         self.register_buffer("lives", torch.zeros(streams, dtype=torch.bool))
 
     def begin(self, model: MotionModel) -> None:
-        """Make room for the streams' states."""
+        """Allocate the streams' states."""
         for name, tensor in model.initial_state(1).items():
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
-        """Draw the training call of a step: the next streams, each moved on by one stride.
+        """Draw the batch of a training step: the next streams, each advanced by one stride.
 
         Call `keep` before the next draw: it stores the new states of the streams that were drawn last.
         """
@@ -182,6 +182,6 @@ class PersistentStreams(Rollout):
         )
 
     def keep(self, state: State) -> None:
-        """Keep the streams' states after the training call."""
+        """Store the streams' states after a training step."""
         for name, tensor in state.items():
             self.get_buffer(f"state_{name}")[self.who] = distributed.gather_rows(tensor.detach())

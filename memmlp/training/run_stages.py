@@ -1,6 +1,6 @@
-"""Runs an experiment to its end: data, prerequisite runs, the network's run, evaluations and deployment.
+"""Run an experiment: data, prerequisite runs, the network's run, evaluations and deployment.
 
-Each stage has an id (memmlp.runs.identity). A stage whose id exists already is reused; otherwise it is made.
+Each stage has an id (memmlp.runs.identity). A stage with an existing id is reused; other stages are run.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from memmlp.runs.identity import (
 )
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
-from memmlp.training.devices import describe_device, overlooked_gpu
+from memmlp.training.devices import describe_device, describe_unused_gpu
 from memmlp.training.loop import ValidationCallback
 from memmlp.training.request import (
     Outcome,
     RunRequest,
     announce_data,
-    data_warnings,
-    own_code,
-    partial_words,
-    results_of,
-    unmeasured,
+    collect_data_warnings,
+    describe_missing_data,
+    describe_user_code,
+    list_missing_modes,
+    read_results,
 )
 from memmlp.training.train_network import NetworkTraining, Training
 from memmlp.training.train_refiner import RefinerTraining
@@ -58,18 +58,18 @@ from memmlp.training.train_refiner import RefinerTraining
 
 @dataclass(frozen=True)
 class Experiment(RunRequest):
-    """A request with all that its runs need, as built objects.
+    """A request with the built objects that its runs need.
 
     Attributes:
         device: device of training and evaluation.
         architecture: builds the networks.
-        prerequisites: how to train the runs that the network builds upon; each builds upon the one before.
-        training: how the network is trained.
-        evaluation: how the network is evaluated.
-        deployment: how the network is exported and timed; None where it is not deployed.
-        loggers: show the runs elsewhere, such as in MLflow.
+        prerequisites: the trainings of the prerequisite runs; each training uses the run before it.
+        training: the network's training.
+        evaluation: the network's evaluation.
+        deployment: the network's export and timing; None without a deployment.
+        loggers: report the runs to other programs, such as MLflow.
         make_name: makes a readable name for a run from its kind and its config.
-        unrefined: the experiment of the network that is refined; None without a refiner.
+        unrefined: the experiment of the network without its refiner; None without a refiner.
     """
 
     device: torch.device
@@ -84,19 +84,19 @@ class Experiment(RunRequest):
 
 
 def run_in_processes(experiment: Experiment) -> Outcome | None:
-    """Run the experiment to its end, in this process alone or with the other processes of torchrun.
+    """Run the experiment in this process, or together with the other processes of torchrun.
 
-    The first process holds the run's lock, prepares the data, writes files, evaluates and deploys. It tells
-    the other processes which stage all of them train next.
+    The first process holds the run's lock, prepares the data, writes files, evaluates and deploys. It
+    broadcasts to the other processes which stage to train next.
 
     Returns:
         The outcome in the first process, None in the others.
     """
     if experiment.unrefined and distributed.world_size() > 1:
-        raise InputError("refiner: several processes cannot train it; start one process, or set refiner=null")
+        raise InputError("refiner: must be null with several processes; or start one process")
     distributed.connect(experiment.device.type)
     if not distributed.is_first():
-        _train_along(experiment)
+        _train_named_stages(experiment)
         return None
     outcome = run_experiment(experiment)
     distributed.broadcast("end")
@@ -104,8 +104,8 @@ def run_in_processes(experiment: Experiment) -> Outcome | None:
     return outcome
 
 
-def _train_along(experiment: Experiment) -> None:
-    """Train the stages that the first process names, until it names the end."""
+def _train_named_stages(experiment: Experiment) -> None:
+    """Train the stages that the first process broadcasts, until it broadcasts "end"."""
     while (stage := distributed.broadcast("")) != "end":
         data = experiment.motion.prepare()  # the first process has prepared it
         identities = experiment.identities(data.digest)
@@ -118,7 +118,7 @@ def _train_along(experiment: Experiment) -> None:
 
 
 def run_experiment(experiment: Experiment, on_validation: ValidationCallback | None = None) -> Outcome:
-    """Run the experiment to its end, doing only what is missing.
+    """Run the missing stages of the experiment.
 
     Args:
         experiment: what to run.
@@ -130,18 +130,18 @@ def run_experiment(experiment: Experiment, on_validation: ValidationCallback | N
     run = Run.from_id(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
         if experiment.evaluations:
-            data.open("test")  # raises the error of absent test clips before the training, not after it
+            data.open("test")  # reports missing test clips before the training, not after it
         experiment.training.optim.check_installed()
-        if overlooked := overlooked_gpu(config["device"]):
+        if overlooked := describe_unused_gpu(config["device"]):
             notify(overlooked)
     before = None if run.done and not config["force"] else make_prerequisites(experiment, data)
     with run.lock():
         if config["force"]:
             run.reset()
         made = []
-        with recording_outcome(experiment, run):
+        with record_outcome(experiment, run):
             if not run.done:
-                # Another process may have restarted the run since it was found done.
+                # Another process may have restarted the run in the meantime.
                 before = before or make_prerequisites(experiment, data)
                 train_run(experiment, run, data, before, on_validation)
                 made.append("training")
@@ -150,41 +150,41 @@ def run_experiment(experiment: Experiment, on_validation: ValidationCallback | N
             model = experiment.architecture.load(run.weights()).to(experiment.device)
             test = data.open("test").to(experiment.device)
             save_predictions(experiment.evaluation, model, test, Path(folder))
-    return Outcome(run, tuple(made), results_of(experiment, run), experiment.stage_ids)
+    return Outcome(run, tuple(made), read_results(experiment, run), experiment.stage_ids)
 
 
 def complete_stages(
     experiment: Experiment, run: Run, data: Prepared, again: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """Make the missing evaluations and deployment of a trained run, and return its results.
+    """Run the missing evaluations and deployment of a trained run, and return its results.
 
     Args:
-        experiment: says which evaluations and deployment.
+        experiment: defines the evaluations and the deployment.
         run: the trained run.
         data: the prepared motion.
-        again: whether to repeat evaluations that were made before.
+        again: whether to repeat existing evaluations.
 
     Returns:
-        The results, and the names of the stages that were made.
+        The results, and the names of the stages that were run.
     """
-    with run.lock(), recording_outcome(experiment, run, again):
+    with run.lock(), record_outcome(experiment, run, again):
         if again:
             evaluate_run(experiment, run, data, experiment.evaluation.modes)
         made = [*(["evaluation"] if again else []), *make_missing_stages(experiment, run, data)]
-    return results_of(experiment, run), made
+    return read_results(experiment, run), made
 
 
 def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
-    """Make the missing evaluations and deployment of a trained run.
+    """Run the missing evaluations and deployment of a trained run.
 
     Returns:
-        The names of the stages that were made.
+        The names of the stages that were run.
     """
     made = []
     run.request_stages(experiment.stage_ids)
-    if missing := unmeasured(experiment, run):
+    if missing := list_missing_modes(experiment, run):
         if any(run.has(experiment.evaluations[mode]) for mode in missing):
-            announce("evaluation: code of the metrics' packages has changed since they were measured")
+            announce("evaluation: the code of custom metrics has changed, so they are measured again")
         evaluate_run(experiment, run, data, missing)
         made.append("evaluation")
     if experiment.deployment_id and not run.has(experiment.deployment_id):
@@ -194,7 +194,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
 
 
 def make_prerequisites(experiment: Experiment, data: Prepared, last: str | None = None) -> Run | None:
-    """Train the missing prerequisite runs in order, and return the last of them; None without any.
+    """Train the missing prerequisite runs in order; return the last run, or None without prerequisites.
 
     Args:
         experiment: the experiment.
@@ -218,17 +218,17 @@ def find_or_train(
     data: Prepared,
     before: Run | None,
 ) -> Run:
-    """Return the finished prerequisite run with that identity, training it upon `before` if necessary."""
+    """Return the prerequisite run with that identity; train it from the run `before` if necessary."""
     run = Run.from_id(experiment.outputs, identity.id)
     with run.lock():
         if run.done:
             return run
-        with recording_outcome(experiment, run):
-            begin(experiment, run, identity, dict(identity.config), before)
-            run.write_manifest({"partial": partial_words(experiment.config, data)})
+        with record_outcome(experiment, run):
+            begin_run(experiment, run, identity, dict(identity.config), before)
+            run.write_manifest({"partial": describe_missing_data(experiment.config, data)})
             announce(f"{training.description} (run {run.id})")
             weights = before.weights() if before else None
-            distributed.broadcast(training.kind)  # tells the others what is trained now
+            distributed.broadcast(training.kind)  # tells the other processes what to train
             errors = training.train(experiment.architecture, data, weights, run, experiment.device)
             write_json(run.results_path, {"val": errors})
             run.finish(("model.safetensors", "results.json"))
@@ -236,14 +236,14 @@ def find_or_train(
 
 
 @contextlib.contextmanager
-def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
-    """Follow work on a run in the loggers, and record in the run's folder how it ended.
+def record_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
+    """Report work on a run to the loggers, and record failures in the run's folder.
 
     Only failures of the work itself are recorded. Bad input, interruptions, a full disk, a closed output
-    pipe, and the loss of the run to another process are not.
+    pipe, and the loss of the run to another process are not recorded.
     """
     missing = again or not run.done or not all(map(run.has, experiment.stage_ids))
-    missing = missing or bool(unmeasured(experiment, run))
+    missing = missing or bool(list_missing_modes(experiment, run))
     loggers = experiment.loggers if missing else Loggers((), experiment.outputs)
     with loggers.show_run(run):
         try:
@@ -267,15 +267,15 @@ def train_run(
     before: Run | None,
     on_validation: ValidationCallback | None = None,
 ) -> None:
-    """Train the network of a run upon the weights of the run before it, and mark the run as done."""
+    """Train a run's network from the weights of the run `before`, and mark the run as done."""
     steps = experiment.training.optim.steps
-    announce(f"network: train it for {steps} steps (run {run.id})")
-    begin(experiment, run, experiment.identity(data.digest), experiment.config, before)
-    run.write_manifest({"body": data.manifest.body, **data_warnings(experiment.config, data)})
+    announce(f"network: training for {steps} steps (run {run.id})")
+    begin_run(experiment, run, experiment.identity(data.digest), experiment.config, before)
+    run.write_manifest({"body": data.manifest.body, **collect_data_warnings(experiment.config, data)})
     run.request_stages(experiment.stage_ids)
     run.clear_stages()
     weights = before.weights() if before else None
-    distributed.broadcast(NETWORK)  # tells the others what is trained now
+    distributed.broadcast(NETWORK)  # tells the other processes what to train
     experiment.training.train(experiment.architecture, data, weights, run, experiment.device, on_validation)
     run.finish(("model.safetensors",))
 
@@ -283,11 +283,11 @@ def train_run(
 def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequence[str]) -> None:
     """Evaluate a trained run in the given modes.
 
-    Each evaluation is one file, which is written completely or not at all. The picture is drawn once.
+    Each evaluation is one file, which is written atomically. The picture is drawn once.
     """
     run.attempt("evaluation")
     announce(f"evaluation: measure the errors on the test clips, in {' and '.join(modes)} mode")
-    with timed(run, "evaluate"):
+    with record_time(run, "evaluate"):
         model = experiment.architecture.load(run.weights()).to(experiment.device)
         test = data.open("test").to(experiment.device)
         for mode in modes:
@@ -296,8 +296,8 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
             report |= {
                 "component_versions": find_evaluation_versions(settings),
-                **machine(experiment),
-                **own_code(experiment),
+                **describe_machine(experiment),
+                **describe_user_code(experiment),
             }
             write_report(run.evaluation(name), report | experiment.evaluation.report(model, test, mode))
         if not run.picture.exists() and find_spec("matplotlib"):
@@ -305,7 +305,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
 
 
 def draw_first_clip(model: MotionModel, test: MotionDataset, path: Path) -> None:
-    """Draw the start of the first test clip beside the truth, as a PNG."""
+    """Draw prediction and truth for the start of the first test clip, as a PNG."""
     from memmlp.report.pictures.clip_pictures import (
         ClipPiece,
         write_picture,  # matplotlib takes 0.5 s to import
@@ -316,13 +316,13 @@ def draw_first_clip(model: MotionModel, test: MotionDataset, path: Path) -> None
 
 
 def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
-    """Make the deployment: export a trained run, check the file against torch, time it."""
+    """Export a trained run, compare the file with torch, and time it."""
     run.attempt("deployment")
     announce("deployment: export to ONNX, compare with torch, and time a frame")
     deployment, name = experiment.deployment, experiment.deployment_id
     assert deployment is not None
     assert name is not None
-    with timed(run, "export"):
+    with record_time(run, "export"):
         model = experiment.architecture.load(run.weights())
         clips = [data.open(part).clips() for part in ("train", "test")]
         deployed = run.deployment(name)
@@ -335,12 +335,12 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
         deployed.finish({"run": run.manifest["id"], "settings": settings, **record})
 
 
-def begin(
+def begin_run(
     experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any], before: Run | None
 ) -> None:
-    """Begin a training: write its config, and record in the manifest its identity and the machine.
+    """Begin a training: write its config, and record its identity and the machine in the manifest.
 
-    The manifest also has the origin of the weights that the training builds upon (`before`).
+    The manifest also has the origin of the prerequisite run's weights (`before`).
     """
     above = identity.prerequisite
     counting: Mapping[str, Any] = {**(above.config if above else {}), **identity.config}
@@ -351,23 +351,23 @@ def begin(
             else {}
         ),
         "component_versions": identity.component_versions,
-        **machine(experiment),
+        **describe_machine(experiment),
         "processes": distributed.world_size(),
-        **own_code(experiment),
+        **describe_user_code(experiment),
         "name": experiment.make_name(identity.kind, counting),
-        "user": user(),
+        "user": find_user_name(),
     }
     run.begin(identity.kind, config, data=identity.data, prerequisite=above.id if above else None, **facts)
 
 
-def user() -> str | None:
-    """Return the user's name, if the system knows it."""
+def find_user_name() -> str | None:
+    """Return the user's name; None if the system does not know it."""
     with contextlib.suppress(KeyError, OSError, ImportError):
         return getpass.getuser()
     return None
 
 
-def machine(experiment: Experiment) -> dict[str, Any]:
+def describe_machine(experiment: Experiment) -> dict[str, Any]:
     """Return the facts that can change the last digits of a result: device, GPU, threads, precision."""
     return {
         **describe_device(experiment.device),
@@ -377,8 +377,8 @@ def machine(experiment: Experiment) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def timed(run: Run, stage: str) -> Iterator[None]:
-    """Add the seconds that a stage takes to those of earlier work on it, in other modes or precisions."""
+def record_time(run: Run, stage: str) -> Iterator[None]:
+    """Add a stage's seconds to the seconds of earlier work on that stage."""
     started = time.monotonic()
     yield
     before = run.manifest.get("seconds", {}).get(stage, 0.0)

@@ -1,4 +1,4 @@
-"""The trainings of a motion network, and of the VQ-VAE that its memory may use (App. A)."""
+"""The training of motion networks, and of the VQ-VAE for their memory (App. A)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ VALIDATION_PIECE = 240  # frames, 4 s: validation streams through pieces of clip
 
 
 class Training:
-    """How the weights of a run are trained; the interface of all trainings.
+    """The interface of trainings, which train the weights of a run.
 
     Attributes:
         kind: the kind of the run (see `Identity`).
@@ -40,7 +40,7 @@ class Training:
 
     @property
     def description(self) -> str:
-        """What the training does, in words."""
+        """A short text about the training, for progress messages."""
         return self.kind
 
     def train(
@@ -57,8 +57,8 @@ class Training:
         Args:
             architecture: builds the network.
             data: the prepared motion.
-            prerequisite: file of the weights of the run before, such as a frozen VQ-VAE's, or None.
-            run: the run whose folder takes checkpoints, log and weights.
+            prerequisite: weights file of the prerequisite run, such as a frozen VQ-VAE; None without one.
+            run: the run; its folder receives checkpoints, log and weights.
             device: the device to train on.
             on_validation: called after each validation; see `memmlp.training.loop.train`.
 
@@ -76,15 +76,15 @@ def read_last_errors(run: Run) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class NetworkTraining(Training):
-    """How a motion network is trained.
+    """The training of a motion network.
 
     Attributes:
         seed: seed of the weights, batches and rollouts.
         loss: makes the loss, given the network's branches.
         rollout: makes the history that the network is trained on.
         optim: steps, learning rates and intervals.
-        drawn_by: how training windows are drawn, "frames" or "clips" (see WindowSampler).
-        shares: the share of windows drawn from each source (see WindowSampler).
+        drawn_by: the sampling of training windows, "frames" or "clips" (see WindowSampler).
+        shares: the fraction of windows drawn from each source (see WindowSampler).
         metrics: custom metrics, measured at validations.
         mirror: whether half of the training windows are mirrored (see MirroredDataset).
     """
@@ -108,18 +108,18 @@ class NetworkTraining(Training):
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
         """Train a network; see Training."""
-        task = self.task(architecture, data, prerequisite, device)
+        task = self.make_task(architecture, data, prerequisite, device)
         train(task, self.optim, run, self.seed, "network", on_validation)
         if distributed.is_first():
-            checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
+            checkpoint.write(run.model, checkpoint.collect_module_tensors("model", task.model), {})
         return read_last_errors(run)
 
-    def task(
+    def make_task(
         self, architecture: Architecture, data: Prepared, prerequisite: Path | None, device: torch.device
     ) -> MotionTask:
-        """Make the task of training an untrained network; for the arguments see `train`.
+        """Make the task of training a new network; see `train` for the arguments.
 
-        It seeds torch for the first weights, and restarts the rollout.
+        It seeds torch for the initial weights, and restarts the rollout.
         """
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
@@ -162,12 +162,12 @@ class MotionTask(TrainingTask):
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
-        """Return the model's trainable parameters and those of the loss weighting."""
+        """Return the trainable parameters of the model and of the loss weighting."""
         trained = [p for p in self.model.parameters() if p.requires_grad]
         return [{"params": trained}, *self.loss.weighting.parameter_groups()]
 
     def step(self, step: int) -> StepResult:
-        """Compute the loss of one training call."""
+        """Compute the loss of a training step."""
         call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
         motion, state, own = self.training_call(call.sparse, call.state, call.true_frames)
         self.rollout.keep(state)
@@ -181,16 +181,16 @@ class MotionTask(TrainingTask):
         return {f"weight_{name}": value for name, value in self.loss.weighting.weights().items()}
 
     def validate(self) -> dict[str, float]:
-        """Compute the stream-mode metrics on the validation part."""
+        """Compute the stream-mode metrics on the validation split."""
         return self._validate(self.model)
 
 
 @dataclass(frozen=True)
 class VQVAETraining(Training):
-    """How a VQ-VAE is trained.
+    """The training of a VQ-VAE.
 
-    All frames of the training part are equally likely, whatever `data.drawn_by` and the sources' weights are,
-    since an epoch has each once (reading 5). So networks that draw windows in other ways share their VQ-VAE.
+    Every epoch uses each training frame once (docs/readings.md, no. 5). `data.drawn_by` and the sources'
+    weights have no effect here, so networks with different window sampling can share a VQ-VAE.
 
     Attributes:
         seed: seed of the weights and batches.
@@ -205,8 +205,8 @@ class VQVAETraining(Training):
 
     @property
     def description(self) -> str:
-        """What the training does, in words."""
-        return "VQ-VAE: train it, since the network's memory uses its code-vectors"
+        """A short text about the training, for progress messages."""
+        return "VQ-VAE: training, since the network's memory uses its code-vectors"
 
     def train(
         self,
@@ -217,7 +217,7 @@ class VQVAETraining(Training):
         device: torch.device,
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train the architecture's VQ-VAE, which builds upon no other run; see Training."""
+        """Train the architecture's VQ-VAE; it does not have a prerequisite. See Training."""
         dataset, validation = (data.open(split).to(device) for split in ("train", "val"))
         torch.manual_seed(self.seed)
         normalizer = architecture.make_normalizer(data.manifest, dataset.frames).to(device)
@@ -227,7 +227,7 @@ class VQVAETraining(Training):
         task = VQVAETask(model, normalizer, training, validation, optim, self.seed)
         train(task, optim, run, self.seed, "VQ-VAE", on_validation)
         if distributed.is_first():
-            checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+            checkpoint.write(run.model, checkpoint.collect_module_tensors("model", model), {})
         return task.validate()
 
 
@@ -257,7 +257,7 @@ class VQVAETask(TrainingTask):
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     def report(self) -> dict[str, float]:
-        """Return the perplexity of the step's codes, the exponential of the entropy of their counts."""
+        """Return the perplexity of the step's codes; see `compute_perplexity`."""
         return {"perplexity": compute_perplexity(self.used)}
 
     @torch.no_grad()
@@ -271,6 +271,6 @@ class VQVAETask(TrainingTask):
 
 
 def compute_perplexity(counts: Tensor) -> float:
-    """Return the exponential of the entropy of counts (K,): K if all are equal, 1 if just one is not 0."""
+    """Return the perplexity of counts (K,), the exponential of their entropy: see `torch.special.entr`."""
     share = counts / counts.sum().clamp_min(1)
     return float(torch.special.entr(share).sum().exp())

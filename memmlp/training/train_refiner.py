@@ -1,4 +1,4 @@
-"""The stage that trains a refiner, on the motion that a finished network streams."""
+"""The training of a refiner, on the motion that a trained network streams."""
 
 from __future__ import annotations
 
@@ -20,33 +20,35 @@ from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
-from memmlp.networks.refiner import HIDDEN, Refined, SAGERefinerSettings
+from memmlp.networks.refiner import HIDDEN, RefinedModel, SAGERefinerSettings
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
-from memmlp.training.losses import Fixed, Loss, Terms, TermsLoss
+from memmlp.training.losses import FixedWeights, Loss, Terms, TermsLoss
 from memmlp.training.losses.terms import Comparison, measure_jerk
 from memmlp.training.optim import Optim
 from memmlp.training.train_network import VALIDATION_PIECE, Training, read_last_errors
 
-TOGETHER = 64  # pieces that the network streams through side by side
+STREAMS_TOGETHER = 64  # pieces that the network streams through side by side
 
 
 class SAGERefinerLoss(Loss):
-    """What SAGE-Net's refiner is trained with (CVPR 2024, released code): mostly how rotations move.
+    """The loss of SAGE-Net's refiner (CVPR 2024, released code), dominated by rotation velocities.
 
-    Errors of 6D rotations, and of their movement over one frame and over three, are smooth L1 over all
-    components; positions are by forward kinematics from the pelvis, and those of head and hands with the head
-    on its tracker.
+    Errors of 6D rotations, and of rotation changes over one and three frames, are smooth L1 over all
+    components. Positions come from forward kinematics with the pelvis at the origin. For head and hands, the
+    head is on its tracker instead.
     """
 
     def __init__(self) -> None:
         super().__init__()
         weights = {"rotation_all": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
-        self.weighting = Fixed({**weights, "position_from_pelvis": 0.01, "trackers": 0.01, "jerk": 0.03})
+        self.weighting = FixedWeights(
+            {**weights, "position_from_pelvis": 0.01, "trackers": 0.01, "jerk": 0.03}
+        )
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
-        true, rooted = pair.true_positions, pair.made.posed[1]
+        true, rooted = pair.true_positions, pair.predicted.global_pose[1]
         return {
             "rotation_all": _smooth_l1(error),
             "rotation_velocity": _smooth_l1(error.diff(dim=1)),
@@ -61,27 +63,32 @@ def _smooth_l1(error: Tensor) -> Tensor:
     return F.smooth_l1_loss(error, error.new_zeros(()).expand_as(error))
 
 
-JOINTS: dict[str, Any] = {"orientation": 0.01, "rotation": 0.01, "world_position": 0.01, "hand": 0.01}
-JOINTS |= {"velocity": 60.0, "velocity_3": 20.0, "jerk": 0.03}
-"""The weights of the loss that compares the movement of joints, those of SAGE-Net's loss."""
+JOINT_LOSS_WEIGHTS: dict[str, Any] = {
+    "orientation": 0.01,
+    "rotation": 0.01,
+    "world_position": 0.01,
+    "hand": 0.01,
+}
+JOINT_LOSS_WEIGHTS |= {"velocity": 60.0, "velocity_3": 20.0, "jerk": 0.03}
+"""Weights of the loss that compares joint movements, as in SAGE-Net's loss."""
 
 LOSSES: dict[str, Callable[[], Loss]] = {
     "rotations": SAGERefinerLoss,
-    "joints": partial(TermsLoss, "smooth", **JOINTS),
+    "joints": partial(TermsLoss, "smooth", **JOINT_LOSS_WEIGHTS),
 }
-"""The losses of a refiner, by what they compare the movement of."""
+"""A refiner's losses, by the quantity with the compared movement."""
 
 
 @dataclass(frozen=True)
 class RefinerTraining(Training):
-    """How a refiner is trained.
+    """The training of a refiner.
 
     Attributes:
         seed: seed of the weights, pieces and batches.
-        refiner: says how many pieces are drawn, and how long they are.
+        refiner: the refiner's settings, such as the number and length of pieces.
         optim: steps, learning rates and intervals; a batch consists of pieces.
-        drawn_by: how pieces are drawn, "frames" or "clips" (see WindowSampler).
-        shares: the share of pieces drawn from each source (see WindowSampler).
+        drawn_by: the sampling of pieces, "frames" or "clips" (see WindowSampler).
+        shares: the fraction of pieces drawn from each source (see WindowSampler).
         mirror: whether half of the pieces are mirrored (see MirroredDataset).
         metrics: custom metrics, measured at validations.
     """
@@ -103,7 +110,7 @@ class RefinerTraining(Training):
         device: torch.device,
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train a refiner and write it together with its finished network; see Training."""
+        """Train a refiner, and write it together with the trained network; see Training."""
         assert prerequisite is not None
         plain = data.open("train").to(device)
         dataset = MirroredDataset(plain) if self.mirror else plain
@@ -121,11 +128,11 @@ class RefinerTraining(Training):
         )
         train(task, self.optim, run, self.seed, "refiner", on_validation)
         finished.requires_grad_(True)
-        checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+        checkpoint.write(run.model, checkpoint.collect_module_tensors("model", model), {})
         return read_last_errors(run)
 
     def draw_pieces(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
-        """Draw the pieces: frames (P, n, 252), and the indices (P,) of the clips that they come from."""
+        """Draw the pieces: frames (P, n, 252), and the clip index of each piece (P,)."""
         pieces = WindowSampler(
             dataset, self.refiner.pieces, self.refiner.frames, self.seed, self.drawn_by, self.shares
         )
@@ -138,7 +145,7 @@ class RefinerTask(TrainingTask):
 
     def __init__(
         self,
-        model: Refined,
+        model: RefinedModel,
         loss: Loss,
         dataset: MotionDataset,
         pieces: tuple[Tensor, Tensor],
@@ -149,7 +156,7 @@ class RefinerTask(TrainingTask):
         self.frames, self.clips = pieces
         self.module = nn.ModuleDict({"layers": model.layers, "head": model.head})
         model.network.eval()
-        streamed = modes.predict(model.network, list(self.frames), "stream", TOGETHER)
+        streamed = modes.predict(model.network, list(self.frames), "stream", STREAMS_TOGETHER)
         self.streamed, self._validate = torch.stack(streamed), validate
 
     def step(self, step: int) -> StepResult:
@@ -162,5 +169,5 @@ class RefinerTask(TrainingTask):
         return StepResult(loss, terms, self.clips[drawn])
 
     def validate(self) -> dict[str, float]:
-        """Compute the stream-mode metrics of the network with its refiner on the validation part."""
+        """Compute the stream-mode metrics of network and refiner on the validation split."""
         return self._validate()

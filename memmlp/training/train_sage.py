@@ -1,8 +1,9 @@
-"""How SAGE-Net's parts are trained, one after the other, before the whole network (Feng et al., CVPR 2024).
+"""The training of SAGE-Net's parts, one after the other, before the whole network (Feng et al., CVPR 2024).
 
-The parts are a VQ-VAE for each half of the body, the diffusion model of the upper half's latents, that of the
-lower half's latents given the upper latents that the first model predicts, and the decoder of what both
-predict. Each part is a run of its own, whose file holds all parts trained so far. Finished parts stay frozen.
+The parts are a VQ-VAE for each half of the body, a diffusion model for the latents of each half, and a
+decoder. The lower diffusion model also sees the upper latents that the upper model predicts. The decoder sees
+the predictions of both models. Each part has its own run, and its file holds all parts trained so far.
+Trained parts stay frozen.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ from memmlp.networks.sage_net import SAGENet
 from memmlp.networks.sage_parts import HIDDEN, LOWER, UPPER, HalfVQVAE
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
-from memmlp.training.losses.terms import Body
+from memmlp.training.losses.terms import BodyMotion
 from memmlp.training.optim import Optim
 from memmlp.training.train_network import NetworkTraining, Training, read_last_errors
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
-"""In the order of their training; each builds upon the one before."""
+"""SAGE-Net's parts in training order; each part uses the parts before it."""
 
 VALIDATION_WINDOWS = 256
-HIDDEN_SHARE = 0.5  # of a half's joints, which its VQ-VAE has to guess
+HIDDEN_FRACTION = 0.5  # of a half's joints, which its VQ-VAE has to guess
 HIDDEN_COUNT = 2  # joints of the diffusion models' condition, drawn with replacement
 CODE_WEIGHTS = {"orientation": 0.2, "rotation": 1.0, "position": 5.0, "hand": 5.0, "codebook": 0.25}
 
@@ -50,7 +51,7 @@ class DroppingOptim(Optim):
 
     Attributes:
         lr_drops_at: fractions of the steps at which the learning rate falls.
-        lr_drop: factor by which it is multiplied at each of them.
+        lr_drop: factor on the learning rate at each of these steps.
     """
 
     lr_drops_at: Sequence[float] = ()
@@ -61,8 +62,8 @@ class DroppingOptim(Optim):
 
 
 @dataclass
-class PartSettings:
-    """How a part is trained: by AdamW with a weight decay of 1e-4."""
+class SAGEPartSettings:
+    """The training of one of SAGE-Net's parts, by AdamW with a weight decay of 1e-4."""
 
     steps: int = setting(at_least(1), sized(20, 2000, 188000))
     batch: int = setting(at_least(1), sized(8, 32, 512))  # windows a step
@@ -74,33 +75,33 @@ class PartSettings:
 @component("prerequisite", "sage", version=3)
 @dataclass
 class SAGEPrerequisiteSettings(Settings):
-    """The training of SAGE-Net's parts before the whole network (Feng et al. 2024), each in a run of its own.
+    """The training of SAGE-Net's parts in separate runs, before the whole network (Feng et al. 2024).
 
-    Learning rates and their falls are its authors'; at profile=paper steps draw as many windows as epochs.
-    Of optim, precision and the intervals act here; its optimiser, warmup, ema, clip_norm, weight_decay and
-    compile only act in the training of the whole.
+    Learning rates and their drops are the authors' values. At profile=paper the steps draw as many windows as
+    the authors' epochs. Only precision and the intervals of optim apply to the parts. Its optimiser, warmup,
+    ema, clip_norm, weight_decay and compile apply only to the whole network.
     """
 
-    upper_codes: PartSettings = group(PartSettings)  # the VQ-VAE of the upper half of the body
-    lower_codes: PartSettings = group(PartSettings)  # the VQ-VAE of the lower half
+    upper_codes: SAGEPartSettings = group(SAGEPartSettings)  # the VQ-VAE of the upper half of the body
+    lower_codes: SAGEPartSettings = group(SAGEPartSettings)  # the VQ-VAE of the lower half
     # the diffusion model of the upper half's latents
-    upper_diffusion: PartSettings = group(
-        PartSettings,
+    upper_diffusion: SAGEPartSettings = group(
+        SAGEPartSettings,
         steps=sized(20, 2000, 240000),
         lr=sized(1.0e-3, 1.0e-3, 2.0e-4),
         lr_drops_at=[0.392, 0.588],
     )
     # the diffusion model of the lower half's latents, given the upper ones that the first predicts
-    lower_diffusion: PartSettings = group(
-        PartSettings,
+    lower_diffusion: SAGEPartSettings = group(
+        SAGEPartSettings,
         steps=sized(20, 2000, 193000),
         lr=sized(1.0e-3, 1.0e-3, 2.0e-4),
         lr_drops_at=[0.366, 0.488],
         lr_drop=0.2,
     )
     # the decoder of what both predict
-    decoder: PartSettings = group(
-        PartSettings, steps=sized(20, 1000, 56000), batch="${profile.batch}", lr_drops_at=[], lr_drop=1.0
+    decoder: SAGEPartSettings = group(
+        SAGEPartSettings, steps=sized(20, 1000, 56000), batch="${profile.batch}", lr_drops_at=[], lr_drop=1.0
     )
 
     _sizes = ("name", "frames", "code_width", "code_depth", "code_heads", "dropout")
@@ -113,11 +114,11 @@ class SAGEPrerequisiteSettings(Settings):
         "lower_diffusion": _all,  # it sees what the upper one samples
         "decoder": _all,
     }
-    """The keys of the model that have an effect on the training of each part."""
+    """The model keys that affect the training of each part."""
 
     @classmethod
     def prerequisites(cls, config: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield each part with those keys of the network's config that determine its result, in order."""
+        """Yield each part with the config keys that affect its result, in training order."""
         for kind in PARTS:
             loss = {"loss": config["loss"]} if kind == "decoder" else {}
             yield (
@@ -131,12 +132,12 @@ class SAGEPrerequisiteSettings(Settings):
                 },
             )
 
-    def trainings(self, config: Mapping[str, Any], network: NetworkTraining) -> Iterator[PartTraining]:
+    def trainings(self, config: Mapping[str, Any], network: NetworkTraining) -> Iterator[SAGEPartTraining]:
         """Yield the training of each part, in order.
 
         Args:
             config: the resolved config of the whole network.
-            network: how the whole network is trained; windows are drawn in the same way for its parts.
+            network: the training of the whole network; its parts use the same window sampling.
         """
         same = ("checkpoint_every", "log_every", "precision")
         often = {name: getattr(network.optim, name) for name in same}
@@ -144,17 +145,17 @@ class SAGEPrerequisiteSettings(Settings):
             own = getattr(self, kind)
             betas = (0.9, 0.99) if kind in ("upper_codes", "lower_codes") else (0.9, 0.999)
             optim = DroppingOptim(**own, **often, betas=betas, validate_every=own["steps"])
-            make = DecoderTraining if kind == "decoder" else PartTraining
+            make = SAGEDecoderTraining if kind == "decoder" else SAGEPartTraining
             yield make(kind, replace(network, optim=optim))
 
 
 @dataclass(frozen=True)
-class PartTraining(Training):
-    """How a part is trained, as a run of its own.
+class SAGEPartTraining(Training):
+    """The training of one of SAGE-Net's parts, in its own run.
 
     Attributes:
-        kind: which of PARTS.
-        network: seed, optimisation, and how windows are drawn.
+        kind: the part, one of PARTS.
+        network: seed, optimisation and window sampling.
     """
 
     kind: str
@@ -163,7 +164,7 @@ class PartTraining(Training):
     @property
     def description(self) -> str:
         """What the training does, in words."""
-        return f"{self.kind.replace('_', ' ')}: train it for {self.network.optim.steps} steps"
+        return f"{self.kind.replace('_', ' ')}: training for {self.network.optim.steps} steps"
 
     def train(
         self,
@@ -191,16 +192,18 @@ class PartTraining(Training):
         halves = nn.ModuleDict({"net": net, "upper": parts["codes.upper"], "lower": parts["codes.lower"]})
         halves.eval().requires_grad_(False).to(device)
         objective, validation = make_objective(self.kind, halves), data.open("val").to(device)
-        task = PartTask(part.requires_grad_(True), objective, self.network, dataset, validation, net.frames)
+        task = SAGEPartTask(
+            part.requires_grad_(True), objective, self.network, dataset, validation, net.frames
+        )
         train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "), on_validation)
         if distributed.is_first():
-            checkpoint.write(run.model, before | checkpoint.module_tensors(name, part), {})
+            checkpoint.write(run.model, before | checkpoint.collect_module_tensors(name, part), {})
         return read_last_errors(run)
 
 
 @dataclass(frozen=True)
-class DecoderTraining(PartTraining):
-    """How the decoder is trained: like the whole network, on what the finished diffusion models predict."""
+class SAGEDecoderTraining(SAGEPartTraining):
+    """The training of SAGE-Net's decoder on predictions of the trained diffusion models."""
 
     def train(
         self,
@@ -216,8 +219,8 @@ class DecoderTraining(PartTraining):
         return self.network.train(fixed, data, prerequisite, run, device, on_validation)
 
 
-class PartTask(TrainingTask):
-    """The training task of a part: the sum of an objective's losses, on windows of T frames."""
+class SAGEPartTask(TrainingTask):
+    """The training task of one of SAGE-Net's parts, which minimises an objective on windows of T frames."""
 
     def __init__(
         self,
@@ -243,12 +246,12 @@ class PartTask(TrainingTask):
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Compute the losses on the validation windows, with no joints hidden and with sampled latents."""
+        """Compute the losses on the validation windows, with all joints visible and with sampled latents."""
         return {name: float(term) for name, term in self.objective(self.validation, False).items()}
 
 
 Objective = Callable[[Tensor, bool], dict[str, Tensor]]
-"""Maps world windows (B, T, 252), and whether it is for training, to weighted losses by name."""
+"""Maps world windows (B, T, 252) and a training flag to weighted losses by name."""
 
 
 def make_objective(kind: str, halves: nn.ModuleDict) -> Objective:
@@ -258,59 +261,59 @@ def make_objective(kind: str, halves: nn.ModuleDict) -> Objective:
         kind: one of PARTS, except "decoder".
         halves: the network ("net"), and the VQ-VAE of each half ("upper", "lower").
     """
-    half, of = kind.split("_")
+    half, part = kind.split("_")
     net, codes = halves["net"], halves[half]
     assert isinstance(net, SAGENet)
     assert isinstance(codes, HalfVQVAE)
-    if of == "codes":
+    if part == "codes":
         return partial(compute_code_losses, net, codes)
     return partial(compute_latent_losses, net, codes, lower=half == "lower")
 
 
 def compute_code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the losses of a VQ-VAE: of the last frame's rotations and joints, and of its codebooks.
+    """Return a VQ-VAE's losses: rotations and joint positions of the last frame, and the codebooks' loss.
 
-    In training, random joints of its half except the first are hidden, so that the VQ-VAE has to guess them.
-    The half with the hands also has a loss of the hands' positions.
+    In training, random joints of the half are hidden, except the first joint, so that the VQ-VAE learns to
+    guess them. The upper half also has a loss for the hands' positions.
 
     Args:
-        net: the network, whose space the VQ-VAE works in.
+        net: the network; the VQ-VAE works in its network space.
         codes: the VQ-VAE.
         frames: world windows (B, T, 252).
         training: whether joints are hidden.
     """
     rotation, encoded = encode_windows(net, frames)
     sixd = rotation.unflatten(-1, (N_JOINTS, 6))
-    hidden = distributed.draw_rows(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_SHARE
+    hidden = distributed.draw_rows(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_FRACTION
     hidden[:, codes.joints[0]] = False
     shown = sixd.masked_fill(hidden[:, None, :, None], HIDDEN) if training else sixd
     latent, codebook = codes.encode(shown.flatten(-2), encoded)
     made = codes.decode(latent)[:, -1].unflatten(-1, (-1, 6))
-    errors = measure_half(net, codes.joints, made, frames[:, -1], sixd[:, -1])
+    errors = measure_half_errors(net, codes.joints, made, frames[:, -1], sixd[:, -1])
     return {name: CODE_WEIGHTS[name] * term for name, term in (errors | {"codebook": codebook}).items()}
 
 
-def measure_half(
-    net: SAGENet, joints: tuple[int, ...], made: Tensor, frame: Tensor, true: Tensor
+def measure_half_errors(
+    net: SAGENet, joints: tuple[int, ...], predicted: Tensor, frame: Tensor, truth: Tensor
 ) -> dict[str, Tensor]:
-    """Return errors of a half's rotations and of its joints by forward kinematics (smooth L1).
+    """Return smooth L1 errors of a half's rotations, and of its joint positions by forward kinematics.
 
     A half contains all ancestors of its joints, so the other joints' rotations do not matter.
 
     Args:
-        net: the network, whose space the rotations are in.
+        net: the network; the rotations are in its network space.
         joints: the half's joints.
-        made: the half's predicted rotations (B, J, 6).
+        predicted: the half's predicted rotations (B, J, 6).
         frame: world frames (B, 252).
-        true: the true rotations (B, 22, 6) of all joints.
+        truth: the true rotations (B, 22, 6) of all joints.
     """
     sparse, own = frame[:, None, :SPARSE_DIM], list(joints)
-    full = true.clone()
-    full[:, own] = made.to(true)
-    motions = [net.normalizer.posed(sixd.flatten(-2)[:, None], sparse) for sixd in (full, true)]
-    bodies = [Body(motion, net.normalizer) for motion in motions]
+    full = truth.clone()
+    full[:, own] = predicted.to(truth)
+    motions = [net.normalizer.posed(sixd.flatten(-2)[:, None], sparse) for sixd in (full, truth)]
+    bodies = [BodyMotion(motion, net.normalizer) for motion in motions]
     with in_float32(frame.device):
-        (found, placed), (expected, true_placed) = [(one.sixd, one.posed[1]) for one in bodies]
+        (found, placed), (expected, true_placed) = [(one.sixd, one.global_pose[1]) for one in bodies]
     errors = {
         "orientation": F.smooth_l1_loss(found[..., ROOT, :], expected[..., ROOT, :]),
         "rotation": F.smooth_l1_loss(found[..., own[1:], :], expected[..., own[1:], :]),
@@ -326,10 +329,10 @@ def measure_half(
 def compute_latent_losses(
     net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool, lower: bool
 ) -> dict[str, Tensor]:
-    """Return the error of a half's latents (smooth L1); for other arguments see `compute_code_losses`.
+    """Return the smooth L1 error of a half's latents; see `compute_code_losses` for the other arguments.
 
     Args:
-        lower: whether the half is the lower one, which is given sampled latents of the upper half.
+        lower: whether this is the lower half; it also sees sampled latents of the upper half.
     """
     rotation, encoded = encode_windows(net, frames)
     clean = encode_latents(codes, rotation, encoded)
@@ -339,7 +342,7 @@ def compute_latent_losses(
         sampled = net.sample_lower(upper, encoded) if lower else upper
         return {"latent": F.smooth_l1_loss(sampled, clean)}
     noisy, time, hidden = add_noise(net, clean)
-    denoiser, noisy = (net.lower, net.lower.join(noisy, upper)) if lower else (net.upper, noisy)
+    denoiser, noisy = (net.lower, net.lower.merge_latents(noisy, upper)) if lower else (net.upper, noisy)
     return {"latent": F.smooth_l1_loss(denoiser(noisy, time, encoded, hidden), clean)}
 
 
@@ -353,7 +356,7 @@ def encode_windows(net: SAGENet, frames: Tensor) -> tuple[Tensor, Tensor]:
 def encode_latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tensor:
     """Return a trained VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54).
 
-    They are computed in float32 in a mixed-precision training, too: rounded ones have other code-vectors.
+    The latents are always computed in float32, because rounding would select other code-vectors.
     """
     assert not codes.training
     with in_float32(rotation.device):

@@ -17,7 +17,7 @@ from memmlp.training import devices
 @pytest.fixture
 def found(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch finds the GPUs of this process."""
-    monkeypatch.setattr(devices, "missing_gpu", lambda: None)
+    monkeypatch.setattr(devices, "describe_missing_gpu", lambda: None)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, n
         ("cuda:1", "0,1", "local", "device=cuda:1"),
         ("cuda:1", "", "ray", "device=cuda:1"),
         ("cuda", "", "local", "device=cuda: no GPU is visible here"),
-        ("auto", "0", "local", "torch .* finds none"),
+        ("auto", "0", "local", "torch .* does not find one"),
     ],
 )
 def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, visible, executor, line):
@@ -94,7 +94,7 @@ def test_workers_know_whether_they_are_to_have_a_gpu(
     monkeypatch.setattr(Workers, "start_executor", lambda *_, **__: Shelf(gives))
     path, fleet = start_fleet(tmp_path, Plan("s", tmp_path, (), ()), Workers(executor, count=1), wanted)
     assert fleet.work.args[-1] is gpu
-    monkeypatch.setattr(devices, "missing_gpu", lambda: "none is there")
+    monkeypatch.setattr(devices, "describe_missing_gpu", lambda: "none is there")
     monkeypatch.setattr(worker_process, "work_off", lambda *_: None)
     assert fleet.work() == ("none is there" if gpu else None)
     assert path.exists()

@@ -141,7 +141,8 @@ def test_layers_that_would_draw_or_count_by_themselves_are_refused(two: None, la
 
 def test_layers_that_draw_for_the_whole_batch_or_nothing_are_not():
     assert (
-        layers.find_batch_dependent(nn.Sequential(layers.Dropout(0.1), nn.Dropout(0.0), nn.LSTM(3, 3))) == []
+        layers.find_batch_dependent_layers(nn.Sequential(layers.Dropout(0.1), nn.Dropout(0.0), nn.LSTM(3, 3)))
+        == []
     )
 
 

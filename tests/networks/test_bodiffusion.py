@@ -10,7 +10,7 @@ from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks import diffusion as ancestral
-from memmlp.networks.streaming import has_stream, streaming
+from memmlp.networks.streaming import has_streaming_graph, streaming
 
 CLIP = tiny.clip(25)
 TRUTH = tiny.clip(7)[None].expand(64, -1, -1)
@@ -45,7 +45,7 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
 @torch.no_grad()
 def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypatch):
     """Window by window and frame by frame, with steps that add noise."""
-    monkeypatch.setattr(ancestral, "QUIET", 1)
+    monkeypatch.setattr(ancestral, "FIRST_NOISY_TIME", 1)
     model = tiny.baseline("bodiffusion", offline=True, sampling_steps=2, depth=1).double()
     sparse = CLIP[:, :SPARSE_DIM].double()
     noise = torch.randn(2, 25, 132, generator=torch.Generator().manual_seed(0)).double()
@@ -71,7 +71,7 @@ def test_offline_it_is_no_stream():
     before, after = (modes.predict_windows(model, [one])[0] for one in (clip, changed))
     assert not torch.allclose(before[4], after[4])  # the windows in between carry it there
     assert not model.is_stream
-    assert not has_stream(model)
+    assert not has_streaming_graph(model)
     with pytest.raises(InputError, match=r"model\.offline=true"):
         streaming(model)
     report = Evaluation(["window"], 4, NoIK(), 0).report(model, tiny.frames((20,)), "window")

@@ -36,6 +36,8 @@ def test_a_checkpoint_that_is_replaced_while_it_is_read_is_the_old_one(tmp_path,
 
 def test_a_module_is_loaded_from_its_own_tensors_alone():
     module, other = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
-    tensors = checkpoint.module_tensors("model", other) | checkpoint.module_tensors("modelling", module)
+    tensors = checkpoint.collect_module_tensors("model", other) | checkpoint.collect_module_tensors(
+        "modelling", module
+    )
     checkpoint.load_module("model", module, tensors)
     assert torch.equal(module.weight, other.weight)

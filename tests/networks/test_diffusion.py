@@ -8,7 +8,7 @@ import torch
 
 from memmlp.networks.diffusion import (
     AncestralDiffusion,
-    Denoised,
+    DenoiserOutput,
     Diffusion,
     make_cosine_schedule,
     make_linear_schedule,
@@ -68,16 +68,16 @@ def test_the_linear_schedule_is_the_papers():
     assert torch.all(make_linear_schedule(5) > 0)
 
 
-def made(noisy: torch.Tensor, time: torch.Tensor) -> Denoised:
+def made(noisy: torch.Tensor, time: torch.Tensor) -> DenoiserOutput:
     """An affine map of the noisy signal and the time."""
-    return Denoised(0.7 * noisy + 0.01 * time.view(-1, 1, 1), 0.1 * noisy - 0.3)
+    return DenoiserOutput(0.7 * noisy + 0.01 * time.view(-1, 1, 1), 0.1 * noisy - 0.3)
 
 
 @pytest.mark.parametrize("count", [1, 4, 53])
 def test_sampling_is_an_independent_numpy_computation(count):
     """Estimates are kept within limits but for the last; noise is added but at the end and below time 50."""
     diffusion, rng = AncestralDiffusion(60, count).double(), np.random.default_rng(0)
-    noise = rng.normal(size=(diffusion.draws, 2, 4, 3))
+    noise = rng.normal(size=(diffusion.noise_draws, 2, 4, 3))
     limits = torch.tensor(-1.0), torch.tensor(1.5)
 
     def step(x: torch.Tensor, index: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -105,10 +105,10 @@ def test_the_losses_are_an_independent_numpy_computation():
     clean, noise = (torch.randn(3, 1, 1, generator=draw).double() for _ in range(2))
     time = torch.tensor([19, 7, 2])
     noisy = diffusion.add_noise(clean, time, noise)
-    guess = Denoised(*(part.requires_grad_() for part in made(noisy, time)))
+    guess = DenoiserOutput(*(part.requires_grad_() for part in made(noisy, time)))
     error, bound = diffusion.compute_losses(clean, noise, time, guess, OPEN)
     first, second, least, largest = (table[time][:, None, None] for table in tables(kept(20)))
-    share = (guess.share.detach().numpy() + 1) / 2
+    share = (guess.variance_fraction.detach().numpy() + 1) / 2
     estimate = (
         first * diffusion.remove_noise(noisy, guess.noise, time).detach().numpy() + second * noisy.numpy()
     )
@@ -125,4 +125,4 @@ def test_the_losses_are_an_independent_numpy_computation():
     assert float(error.detach()) == pytest.approx(float((noise - guess.noise.detach()).square().mean()))
     bound.backward()
     assert guess.noise.grad is None  # the variances alone learn from it
-    assert guess.share.grad.all()
+    assert guess.variance_fraction.grad.all()

@@ -17,11 +17,11 @@ from memmlp.networks.limb_solver import (
     ELBOWS,
     ENDS,
     MIDDLES,
+    REACH_MARGIN,
     SHOULDERS,
-    SLACK,
     TOES,
     WRISTS,
-    reach_hands,
+    bend_arms_to_trackers,
     use_tracker_rotations,
 )
 
@@ -98,7 +98,7 @@ def test_a_middle_is_where_its_swivel_says_unless_its_twist_is_limited(body):
     bone = torch.nn.functional.normalize(limbs.find_bones(REST)[0], dim=-1)
     cosine, sine = limbs.measure_twist(local, bone.expand(40, -1, -1))
     found = torch.atan2(sine, cosine)[..., 0].rad2deg().abs()
-    limit = torch.tensor(limbs.TWIST).double()
+    limit = torch.tensor(limbs.MAX_TWIST).double()
     assert (found <= limit + 1e-6).all()
     free = found < limit - 1e-6
     assert 20 < int(free.sum()) < 140
@@ -112,9 +112,9 @@ def test_the_smallest_turn_to_a_limit_is_what_a_search_finds():
     local, bone, axis = sixd_to_matrix(drawn(6, 4, 6)), unit(4, 3), unit(6, 4, 3)
     turn = limbs.limit_twist(local, bone, axis)
     tried = torch.linspace(-math.pi, math.pi, 7201).double()[:, None, None, None]
-    every = limbs.rotate_about(axis.expand(7201, 6, 4, 3), tried.cos(), tried.sin()) @ local
+    every = limbs.make_axis_rotations(axis.expand(7201, 6, 4, 3), tried.cos(), tried.sin()) @ local
     cosine, sine = limbs.measure_twist(every, bone.expand(7201, 6, 4, 3))
-    inside = torch.atan2(sine, cosine)[..., 0].rad2deg().abs() <= torch.tensor(limbs.TWIST) + 0.3
+    inside = torch.atan2(sine, cosine)[..., 0].rad2deg().abs() <= torch.tensor(limbs.MAX_TWIST) + 0.3
     least = torch.where(inside, tried[..., 0].abs(), 10.0).amin(0)
     found = torch.acos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
     assert float(least.max()) < 4
@@ -191,9 +191,9 @@ def test_hands_come_to_their_trackers_and_bones_keep_their_lengths(share: float)
     """Of a hand that is too far away the arm points at it, all but straight."""
     rotations, joints = random_body()
     hands = within_reach(joints, share)
-    turned, placed = reach_hands(rotations, joints, inputs(joints, hands), REST)
+    turned, placed = bend_arms_to_trackers(rotations, joints, inputs(joints, hands), REST)
     away = hands - joints[:, SHOULDERS]
-    nearest = joints[:, SHOULDERS] + away * min(1, (1 - SLACK) / share)
+    nearest = joints[:, SHOULDERS] + away * min(1, (1 - REACH_MARGIN) / share)
     torch.testing.assert_close(placed[:, WRISTS], nearest)
     for joint, child, length in zip((SHOULDERS, ELBOWS), (ELBOWS, WRISTS), LENGTHS, strict=True):
         torch.testing.assert_close(
@@ -207,7 +207,7 @@ def test_hands_come_to_their_trackers_and_bones_keep_their_lengths(share: float)
 def test_the_elbow_stays_on_its_side_of_the_way_to_the_hand():
     rotations, joints = random_body()
     hands = within_reach(joints, 0.7)
-    _, placed = reach_hands(rotations, joints, inputs(joints, hands), REST)
+    _, placed = bend_arms_to_trackers(rotations, joints, inputs(joints, hands), REST)
     axis = torch.nn.functional.normalize(hands - joints[:, SHOULDERS], dim=-1)
 
     def off_axis(positions: torch.Tensor) -> torch.Tensor:
@@ -230,7 +230,7 @@ def test_head_and_wrists_turn_as_their_trackers_and_the_rest_stays():
     )
     others = [joint for joint in range(N_JOINTS) if joint not in (HEAD, *HANDS)]
     torch.testing.assert_close(seen[:, others], rotations[:, others])
-    turned, placed = reach_hands(seen, joints, sparse, REST)
+    turned, placed = bend_arms_to_trackers(seen, joints, sparse, REST)
     kept = [joint for joint in range(N_JOINTS) if not SHOULDERS.start <= joint < ELBOWS.stop]
     assert torch.equal(turned[:, kept], seen[:, kept])
     assert torch.equal(placed[:, : ELBOWS.start], joints[:, : ELBOWS.start])
@@ -247,7 +247,7 @@ def test_a_straight_arm_bends_about_its_axis_and_gradients_are_finite():
     rotations = torch.eye(3).double().expand(1, N_JOINTS, 3, 3).clone().requires_grad_()
     joints = rest[None].clone().requires_grad_()
     hands = rest[None, SHOULDERS] + 0.7 * (rest[None, WRISTS] - rest[None, SHOULDERS])
-    turned, placed = reach_hands(rotations, joints, inputs(joints.detach(), hands), rest)
+    turned, placed = bend_arms_to_trackers(rotations, joints, inputs(joints.detach(), hands), rest)
     assert (placed[0, ELBOWS, 2] - rest[ELBOWS, 2] < -0.1).all()  # Z is to the front in the rest pose
     (turned.sum() + placed.sum()).backward()
     assert rotations.grad.isfinite().all()

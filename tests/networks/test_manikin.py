@@ -12,7 +12,7 @@ from memmlp.motion.network_coordinates import Heading, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import manikin
 from memmlp.networks.limb_solver import BASES, ENDS, MIDDLES
-from memmlp.networks.manikin import KEPT, PLACED, PredictedParts, Truth
+from memmlp.networks.manikin import PLACED_JOINTS, PREDICTED_JOINTS, PredictedParts, TrueParts
 
 TRUTH = torch.stack([tiny.clip(7, seed) for seed in (1, 2)]).double()
 SPARSE, MOTION = TRUTH[..., :SPARSE_DIM], TRUTH[..., SPARSE_DIM:]
@@ -21,11 +21,11 @@ NAMES = ("manikin_s", "manikin_l")
 
 def outputs() -> torch.Tensor:
     """What a network should predict of the true motion (2, 7, 86)."""
-    true = Truth(MOTION)
+    true = TrueParts(MOTION)
     turned = posed_globally(MOTION)
-    swivel = manikin.measure_swivels(*true.limbs(), turned[..., list(BASES), :, 1])
-    places = [true.between((15,), (7, 8)), true.between((7, 8), (10, 11))]
-    parts = [true.sixd[..., [0, *KEPT], :], swivel.transpose(-1, -2), *places]
+    swivel = manikin.measure_swivels(*true.list_limb_joints(), turned[..., list(BASES), :, 1])
+    places = [true.compute_vectors((15,), (7, 8)), true.compute_vectors((7, 8), (10, 11))]
+    parts = [true.sixd[..., [0, *PREDICTED_JOINTS], :], swivel.transpose(-1, -2), *places]
     return torch.cat([part.flatten(-2) for part in parts], -1)
 
 
@@ -58,7 +58,7 @@ def test_the_true_parts_make_the_true_trunk_hands_and_ankles():
 def filled(sixd: np.ndarray) -> np.ndarray:
     """The rotations (132,) of a body whose joints that are not predicted are not turned."""
     rotation = np.tile([1.0, 0, 0, 0, 1, 0], (22, 1))
-    rotation[[0, *KEPT]] = sixd.reshape(11, 6)
+    rotation[[0, *PREDICTED_JOINTS]] = sixd.reshape(11, 6)
     return rotation.flatten()
 
 
@@ -71,14 +71,14 @@ def test_manikin_s_losses_are_an_independent_computation():
         outputs()[:, -1:] + 0.1 * torch.randn(2, 1, 86, generator=torch.Generator().manual_seed(1)).double()
     )
     found = {
-        name: float(term) for name, term in model.compute_part_losses(made, Truth(MOTION[:, -1:])).items()
+        name: float(term) for name, term in model.compute_part_losses(made, TrueParts(MOTION[:, -1:])).items()
     }
     raw = made[:, 0].numpy()
     true = MOTION[:, -1, POSITION].unflatten(-1, (22, 3)).numpy()
     sixd = MOTION[:, -1, ROTATION].unflatten(-1, (22, 6)).numpy()
-    rotations = [np.abs(raw[b, 6:66].reshape(10, 6) - sixd[b, list(KEPT)]) for b in (0, 1)]
+    rotations = [np.abs(raw[b, 6:66].reshape(10, 6) - sixd[b, list(PREDICTED_JOINTS)]) for b in (0, 1)]
     bodies = [posed(filled(raw[b, :66])) for b in (0, 1)]
-    rooted = [np.abs(bodies[b] - (true[b] - true[b, 0]))[PLACED] for b in (0, 1)]
+    rooted = [np.abs(bodies[b] - (true[b] - true[b, 0]))[PLACED_JOINTS] for b in (0, 1)]
     ankles = [np.abs(raw[b, 74:80].reshape(2, 3) - (true[b, [7, 8]] - true[b, 15])) for b in (0, 1)]
     toes = [np.abs(raw[b, 80:].reshape(2, 3) - (true[b, [10, 11]] - true[b, [7, 8]])) for b in (0, 1)]
     swivel, middle = 0.0, 0.0
@@ -110,10 +110,12 @@ def test_manikin_s_standing_legs_teach_without_bound_nothing():
     torch.manual_seed(0)
     made = model.predict_parts(torch.randn(1, model.frames, SPARSE_DIM)).detach()
     mean, std = (
-        part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[[0, *KEPT]].flatten()
+        part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[[0, *PREDICTED_JOINTS]].flatten()
         for part in (model.normalizer.mean, model.normalizer.std)
     )
-    made[..., : len(mean)] = (torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(1 + len(KEPT)) - mean) / std
+    made[..., : len(mean)] = (
+        torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(1 + len(PREDICTED_JOINTS)) - mean
+    ) / std
     made.requires_grad_()
     joints = model.normalizer.rest.new_zeros(1, 1, N_JOINTS, 3)
     for base, middle, end in zip(BASES, MIDDLES, ENDS, strict=True):
@@ -122,7 +124,7 @@ def test_manikin_s_standing_legs_teach_without_bound_nothing():
         joints[..., base, :] = 0
     sixd = torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(N_JOINTS)
     motion = torch.cat([sixd.expand(1, 1, -1), joints.flatten(-2)], -1)
-    sum(model.compute_part_losses(made, Truth(motion)).values()).backward()
+    sum(model.compute_part_losses(made, TrueParts(motion)).values()).backward()
     assert made.grad.abs().max() < 10
 
 
@@ -131,7 +133,7 @@ def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_w
     model.normalizer = Normalizer.raw(World(), tiny.REST).double()
     auxiliary = MOTION[..., ROTATION][..., 6:]
     made = torch.cat([outputs(), auxiliary], -1)
-    true = Truth(MOTION)
+    true = TrueParts(MOTION)
     assert all(float(term) < 1e-5 for term in model.compute_part_losses(made, true).values())
     turned = made.clone()
     swivel = made[..., 66:74].unflatten(-1, (2, 4))

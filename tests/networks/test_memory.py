@@ -16,7 +16,7 @@ from memmlp.networks.predictor import RotationOnlyMemorySettings, TwoBranchMemor
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
 from memmlp.training.loop import train
-from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty, l1
+from memmlp.training.losses import MotionLoss, PositionHandTerm, UncertaintyWeights, l1
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import PersistentStreams, TeacherForcing
 from memmlp.training.train_network import MotionTask
@@ -83,7 +83,7 @@ def test_every_memory_trains_in_bfloat16(kind, rollout, tmp_path):
     model, made = tiny.model(kind), rollout()
     if isinstance(made, PersistentStreams):
         made.begin(model)
-    loss = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    loss = MotionLoss(UncertaintyWeights(), PositionHandTerm(), model.predictor.branches)
     optim = Optim(steps=3, batch=3, lr=1e-3, precision="bf16", log_every=1)
     task = MotionTask(model, loss, made, SPLIT, optim, 0, validate=lambda model: {})
     train(task, optim, Run(tmp_path), 0, "bf16")
@@ -108,7 +108,7 @@ def joint_task(codebook: str = "ema") -> MotionTask:
     """A tiny network with a VQ-VAE of its own, and its training."""
     vqvae = partial(VQVAE, codes=8, width=12, encoder_depth=2, codebook=codebook)
     model = tiny.model(JointCodeMemory, vqvae=vqvae).train()
-    weighted = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    weighted = MotionLoss(UncertaintyWeights(), PositionHandTerm(), model.predictor.branches)
     optim = Optim(steps=3, batch=5, lr=1e-2)
     return MotionTask(model, weighted, TeacherForcing(), SPLIT, optim, 0, validate=lambda model: {})
 

@@ -24,7 +24,7 @@ from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
 from memmlp.networks.predictor import RotationOnlySettings, TwoBranchMemorySettings, TwoBranchSettings
-from memmlp.networks.streaming import has_stream, streaming
+from memmlp.networks.streaming import has_streaming_graph, streaming
 
 
 def without_blocks() -> MemMLP:
@@ -117,7 +117,7 @@ def test_a_network_without_a_streaming_graph_is_refused():
     model = tiny.baseline("avatar_poser")
     model.__class__ = Different
     for one in (model, tiny.refined(model)):
-        assert not has_stream(one)
+        assert not has_streaming_graph(one)
     with pytest.raises(InputError, match=r"export\.graph=streaming"):
         streaming(model)
 

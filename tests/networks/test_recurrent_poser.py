@@ -13,7 +13,7 @@ from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.recurrent_poser import CELLS, RecurrentCell, scan
+from memmlp.networks.recurrent_poser import CELLS, RecurrentCell, scan_linear_recurrence
 from memmlp.networks.streaming import streaming
 
 CLIP = tiny.clip(24)
@@ -155,7 +155,7 @@ def test_the_scan_is_the_recurrence(length):
         random.normal(size=(2, length, 3)),
         random.normal(size=(2, 3)),
     )
-    found = scan(*map(torch.tensor, (keep, new, state)))
+    found = scan_linear_recurrence(*map(torch.tensor, (keep, new, state)))
     for t in range(length):
         state = keep[:, t] * state + new[:, t]
         np.testing.assert_allclose(found[:, t], state, atol=1e-12)

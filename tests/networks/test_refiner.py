@@ -12,14 +12,14 @@ from memmlp.evaluation.ik import Arms
 from memmlp.evaluation.modes import extract_positions
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.refiner import Refined
+from memmlp.networks.refiner import RefinedModel
 
 CLIP = tiny.clip(24).double()
 SPARSE = CLIP[None, :, :SPARSE_DIM]
 NETWORKS = ["mem_mlp", "agrol_mlp", "avatar_poser", "hmd_poser", "rpm"]
 
 
-def network(name: str) -> Refined:
+def network(name: str) -> RefinedModel:
     one = tiny.model(coordinates=Heading()) if name == "mem_mlp" else tiny.baseline(name, Heading())
     return tiny.refined(one).double()
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from memmlp.networks import sage_parts
-from memmlp.networks.layers import find_batch_dependent
+from memmlp.networks.layers import find_batch_dependent_layers
 from memmlp.networks.sage_net import SAGESettings
 
 PAPER = SAGESettings(20, 512, 12, 8, 256, 4, 4)
@@ -35,7 +35,7 @@ def test_the_shapes_of_a_window_on_its_way_through_the_parts():
     assert [tuple(one.shape) for one in decoded] == [(2, 20, 84), (2, 20, 54)]
     assert sage_parts.UpperDenoiser(SMALL)(latents[0], time, x).shape == (2, 10, 384)
     denoiser = sage_parts.LowerDenoiser(SMALL)
-    assert denoiser(denoiser.join(latents[1], latents[0]), time, x).shape == (2, 10, 384)
+    assert denoiser(denoiser.merge_latents(latents[1], latents[0]), time, x).shape == (2, 10, 384)
     assert sage_parts.Decoder(SMALL)(*latents, x).shape == (2, 20, 132)
 
 
@@ -66,5 +66,5 @@ def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through(
 
 
 def test_several_processes_would_count_codes_each_by_itself():
-    assert find_batch_dependent(sage_parts.HalfVQVAE(sage_parts.LOWER, SMALL)) == ["ProductQuantiser"]
-    assert find_batch_dependent(sage_parts.LowerDenoiser(SMALL)) == []
+    assert find_batch_dependent_layers(sage_parts.HalfVQVAE(sage_parts.LOWER, SMALL)) == ["ProductQuantiser"]
+    assert find_batch_dependent_layers(sage_parts.LowerDenoiser(SMALL)) == []

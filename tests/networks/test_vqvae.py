@@ -17,9 +17,9 @@ def test_a_mixed_precision_training_finds_the_code_vectors_that_evaluation_finds
     latent = model.encoder(frames)
     model.codebook.vectors.copy_(latent[:64])
     with torch.autocast("cpu", torch.bfloat16):
-        vectors = model.code_vectors(frames[:, :54], frames[:, 54:])
+        vectors = model.compute_code_vectors(frames[:, :54], frames[:, 54:])
         indices = model.codebook.find_indices(latent)
-    assert torch.equal(vectors, model.code_vectors(frames[:, :54], frames[:, 54:]))
+    assert torch.equal(vectors, model.compute_code_vectors(frames[:, :54], frames[:, 54:]))
     assert torch.equal(indices, model.codebook.find_indices(latent))
 
 

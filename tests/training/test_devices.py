@@ -7,7 +7,7 @@ import torch
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
-from memmlp.training.devices import device, missing_gpu, overlooked_gpu
+from memmlp.training.devices import choose_device, describe_missing_gpu, describe_unused_gpu
 
 
 @pytest.fixture
@@ -25,19 +25,19 @@ def gpus(monkeypatch: pytest.MonkeyPatch):
 
 def test_with_two_gpus(gpus):
     gpus(2)
-    found = {name: str(device(name)) for name in ("auto", "cpu", "cuda", "cuda:1")}
+    found = {name: str(choose_device(name)) for name in ("auto", "cpu", "cuda", "cuda:1")}
     assert found == {"auto": "cuda:0", "cpu": "cpu", "cuda": "cuda:0", "cuda:1": "cuda:1"}
     with pytest.raises(InputError, match="device=cuda:2: must be cuda:0 to cuda:1"):
-        device("cuda:2")
-    assert missing_gpu() is None
+        choose_device("cuda:2")
+    assert describe_missing_gpu() is None
 
 
 def test_float32_is_no_tf32_on_a_gpu(gpus, monkeypatch: pytest.MonkeyPatch):
     gpus(1)
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
-    device("cpu")
+    choose_device("cpu")
     assert torch.backends.cudnn.allow_tf32
-    device("auto")
+    choose_device("auto")
     assert not torch.backends.cudnn.allow_tf32
     assert not torch.backends.cuda.matmul.allow_tf32
 
@@ -45,22 +45,22 @@ def test_float32_is_no_tf32_on_a_gpu(gpus, monkeypatch: pytest.MonkeyPatch):
 def test_without_gpus(gpus, monkeypatch: pytest.MonkeyPatch):
     gpus(0)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    assert str(device("auto")) == "cpu"
+    assert str(choose_device("auto")) == "cpu"
     for name in ("cuda", "cuda:1", "mps"):
         with pytest.raises(InputError, match=f"device={name}: "):
-            device(name)
+            choose_device(name)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
-    assert "torch" in str(missing_gpu())
-    assert "CUDA_VISIBLE_DEVICES is '3'" in str(missing_gpu())
+    assert "torch" in str(describe_missing_gpu())
+    assert "CUDA_VISIBLE_DEVICES is '3'" in str(describe_missing_gpu())
 
 
 def test_of_several_processes_each_has_its_own(gpus, monkeypatch: pytest.MonkeyPatch):
     gpus(2)
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
     monkeypatch.setenv("LOCAL_RANK", "1")
-    assert str(device("auto")) == "cuda:1"
+    assert str(choose_device("auto")) == "cuda:1"
     with pytest.raises(InputError, match="device=cuda:1: must be cuda with several"):
-        device("cuda:1")
+        choose_device("cuda:1")
 
 
 def test_a_gpu_that_torch_cannot_use_is_told(gpus, monkeypatch, tmp_path):
@@ -77,5 +77,5 @@ def test_a_gpu_that_torch_cannot_use_is_told(gpus, monkeypatch, tmp_path):
         monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
         if visible is not None:
             monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-        monkeypatch.setattr("memmlp.training.devices.NVIDIA", tmp_path / ("." if driver else "none"))
-        assert ("device=cpu" in (overlooked_gpu(name) or "")) == said
+        monkeypatch.setattr("memmlp.training.devices.NVIDIA_DRIVER", tmp_path / ("." if driver else "none"))
+        assert ("device=cpu" in (describe_unused_gpu(name) or "")) == said

@@ -7,7 +7,14 @@ import tiny
 import torch
 
 from memmlp.motion.body import LOWER, SPARSE_DIM
-from memmlp.training.losses import HandFK, HandPosition, Manual, MotionLoss, NoHand, Uncertainty
+from memmlp.training.losses import (
+    KinematicHandTerm,
+    ManualWeights,
+    MotionLoss,
+    NoHandTerm,
+    PositionHandTerm,
+    UncertaintyWeights,
+)
 
 BOTH = frozenset({"rotation", "position"})
 DRAW = torch.Generator().manual_seed(0)
@@ -18,7 +25,7 @@ NORMALIZER = tiny.normalizer()
 
 
 def terms(hand=None, branches=BOTH):
-    loss = MotionLoss(Manual(), hand or HandPosition(), branches)
+    loss = MotionLoss(ManualWeights(), hand or PositionHandTerm(), branches)
     return loss.terms(MOTION, TRUTH[..., SPARSE_DIM:], SPARSE, NORMALIZER)
 
 
@@ -47,20 +54,20 @@ def test_terms_are_the_papers_equations():
 def test_hand_by_forward_kinematics_is_of_the_rotation_branch():
     moved = MOTION.clone()
     moved[..., 132:] += 1
-    loss = MotionLoss(Manual(), HandFK(), BOTH)
+    loss = MotionLoss(ManualWeights(), KinematicHandTerm(), BOTH)
     args = (TRUTH[..., SPARSE_DIM:], SPARSE, NORMALIZER)
     assert torch.equal(loss.terms(MOTION, *args)["hand"], loss.terms(moved, *args)["hand"])
     assert float(loss.terms(TRUTH[..., SPARSE_DIM:], *args)["hand"]) == pytest.approx(0, abs=1e-4)
 
 
 def test_hand_off_and_rotation_only_leave_terms_out():
-    assert "hand" not in terms(NoHand())
+    assert "hand" not in terms(NoHandTerm())
     rotation = frozenset({"rotation"})
-    assert set(terms(HandPosition(), rotation)) == {"rotation_all", "rotation_velocity"}
-    assert set(terms(HandFK(), rotation)) == {"rotation_all", "rotation_velocity", "hand"}
+    assert set(terms(PositionHandTerm(), rotation)) == {"rotation_all", "rotation_velocity"}
+    assert set(terms(KinematicHandTerm(), rotation)) == {"rotation_all", "rotation_velocity", "hand"}
 
 
-def train(weighting: Uncertainty, optimiser: type, steps: int, **losses: float) -> None:
+def train(weighting: UncertaintyWeights, optimiser: type, steps: int, **losses: float) -> None:
     weights = optimiser(weighting.parameter_groups())
     for _ in range(steps):
         weights.zero_grad()
@@ -70,7 +77,7 @@ def train(weighting: Uncertainty, optimiser: type, steps: int, **losses: float) 
 
 def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
     """The minimum of e^-s L + s is s = ln L."""
-    weighting = Uncertainty(lr=0.05)
+    weighting = UncertaintyWeights(lr=0.05)
     weighting.build(["rotation_all", "position_branch"])
     assert weighting.parameter_groups()[0]["lr"] == 0.05
     train(weighting, torch.optim.Adam, 400, rotation_all=4.0, position_branch=0.1)
@@ -79,7 +86,7 @@ def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
 
 
 def test_a_custom_term_has_its_own_weight_also_under_the_name_of_a_term_that_is_not_there():
-    weighting = Manual()
+    weighting = ManualWeights()
     weighting.build(["rotation_all", "hand"], {"hand": 7.0})
     terms = {"rotation_all": torch.tensor(1.0), "hand": torch.tensor(1.0)}
     assert float(weighting(terms)) == pytest.approx(1 + 7)

@@ -14,7 +14,7 @@ from torch import nn
 from memmlp.common.errors import InputError
 from memmlp.runs.run import Run
 from memmlp.training.loop import ValidationCallback, train
-from memmlp.training.optim import EMA, ComposedOptimiser, Muon, Optim, ScheduleFree, WideProducts
+from memmlp.training.optim import EMA, ComposedOptimiser, Float32Products, Muon, Optim, ScheduleFree
 from memmlp.training.train_network import MotionTask
 
 COMMON = {"steps": 12, "batch": 4, "lr": 1e-2, "checkpoint_every": 5, "log_every": 4}
@@ -120,7 +120,7 @@ def test_an_exponential_moving_average_by_hand():
         average.update(step)
         decay = min(0.3, (1 + step) / (10 + step))
         expected = decay * expected + (1 - decay) * value
-    with average.in_place():
+    with average.using_average():
         assert model.weight.item() == pytest.approx(expected)
     assert model.weight.item() == 8
 
@@ -171,7 +171,7 @@ def test_products_are_exact_but_for_one_rounding():
     def rounded(x: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(x).bfloat16()
 
-    with WideProducts():
+    with Float32Products():
         plain, method, sum_ = a @ b, a.matmul(b), torch.addmm(c, a, b, beta=-4.775, alpha=2.0)
         assert (a + 1).dtype == torch.bfloat16
     torch.testing.assert_close(plain, rounded(left @ right), rtol=2**-8, atol=0)

@@ -18,25 +18,25 @@ def warnings(clips: list[SimpleNamespace], name: str = "mine", part: dict | None
     """The warnings on data with these clips and facts of its manifest."""
     whole = {"coverage": SimpleNamespace(whole=True), "listed": {"CMU": 1}, "split": {}, "unusual": {}}
     manifest = SimpleNamespace(clips=clips, **(whole | facts))
-    return request.data_warnings(
+    return request.collect_data_warnings(
         {"data": {"name": name, "split": part or {}}}, SimpleNamespace(manifest=manifest)
     )
 
 
 def test_remarks_count_the_clips_and_name_the_first():
     bad = Skipped("b.npz", "NaN in frame 3")
-    assert request.skipped_remark([]) is request.unusual_remark({}) is None
+    assert request.describe_skipped_files([]) is request.describe_unusual_clips({}) is None
     for word in ("2 files", "b.npz (NaN in frame 3)", "data.strict"):
-        assert word in str(request.skipped_remark([bad, replace(bad, file="c.npz")]))
+        assert word in str(request.describe_skipped_files([bad, replace(bad, file="c.npz")]))
     odd = {"a/1": "Z is not up", "a/2": "Z is not up", "b": "the pelvis is at z = 20 m", "c": "Z is not up"}
     for word in ("4 clips", "a/1 (Z is not up), a/2, b", "memmlp data inspect"):
-        assert word in str(request.unusual_remark(odd))
+        assert word in str(request.describe_unusual_clips(odd))
 
 
 def test_a_single_group_of_test_clips_is_too_few():
     for groups, counts, few in (("abb", ("3", "2"), False), ("aa", ("2", "1"), True)):
         clips = [clip("c", "train"), *(clip("t", "test", group=group) for group in groups)]
-        found = request.tested_clips_remark(clips)
+        found = request.describe_test_clips(clips)
         assert all(count in found for count in counts)
         assert ("data.split.test" in found) == few
 
@@ -54,11 +54,11 @@ def test_clips_that_were_recorded_at_a_lower_rate_are_said():
     rates = {"a": 30.0, "b": 30.0, "c": 60.0, "d": 59.94, "e": 120.0, "f": 100.0}
     clips = [*(clip(name, "test", fps) for name, fps in rates.items()), clip("g", "train", 25.0)]
     lines, splines = SimpleNamespace(interpolation="lines"), SimpleNamespace(interpolation="splines")
-    assert request.low_rates_remark(lines, clips, "clips").startswith(
+    assert request.describe_low_rates(lines, clips, "clips").startswith(
         "3 of 7 clips were recorded at 25 to 30"
     )
-    assert request.low_rates_remark(lines, clips[2:6], "clips") is None
-    assert request.low_rates_remark(splines, clips, "clips") is None
+    assert request.describe_low_rates(lines, clips[2:6], "clips") is None
+    assert request.describe_low_rates(splines, clips, "clips") is None
     assert warnings(clips, interpolation="lines")["resampled"].startswith(
         "2 of 6 test clips were recorded at 30 Hz"
     )

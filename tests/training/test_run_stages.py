@@ -32,7 +32,7 @@ from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled
 from memmlp.training import run_stages
-from memmlp.training.run_stages import make_prerequisites, recording_outcome
+from memmlp.training.run_stages import make_prerequisites, record_outcome
 
 
 def motion_run(folder: Path) -> Run:
@@ -201,7 +201,7 @@ def begun(tmp_path: Path) -> tuple[Any, Run]:
 ])  # fmt: skip
 def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(begun, error, failure):
     experiment, run = begun
-    with pytest.raises(type(error)), recording_outcome(experiment, run):
+    with pytest.raises(type(error)), record_outcome(experiment, run):
         raise error
     assert (run.failure is None) == (failure is None)
     assert (failure or "") in (run.failure or "")
@@ -216,14 +216,16 @@ def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: p
         importlib.import_module("mine")
         evaluations = {"stream": "stream-0", "window": "window-0"}
         experiment: Any = SimpleNamespace(config={"plugins": ["mine"]}, evaluations=evaluations)
-        made = {"mean": {}, "clips": [], **run_stages.own_code(experiment)}
+        made = {"mean": {}, "clips": [], **run_stages.describe_user_code(experiment)}
         write_report(
             run.evaluation("stream-0"), made | {"mode": "stream", "settings": {"metrics": {"a": "mine.a"}}}
         )
-        assert run_stages.unmeasured(experiment, run) == ["window"]
+        assert run_stages.list_missing_modes(experiment, run) == ["window"]
         write_report(run.evaluation("window-0"), made | {"mode": "window", "settings": {}})
-        assert run_stages.unmeasured(experiment, run) == []
+        assert run_stages.list_missing_modes(experiment, run) == []
         code.write_text("A = 2\n")
-        assert run_stages.unmeasured(experiment, run) == []  # this process would measure them as before
+        assert (
+            run_stages.list_missing_modes(experiment, run) == []
+        )  # this process would measure them as before
         environment._read_user_code.cache_clear()
-        assert run_stages.unmeasured(experiment, run) == ["stream"]
+        assert run_stages.list_missing_modes(experiment, run) == ["stream"]

@@ -52,11 +52,11 @@ def test_a_true_pose_has_no_error_and_hands_are_where_the_trackers_are():
     net = tiny.baseline("sage")
     net.normalizer = Normalizer.raw(World(), tiny.REST)
     true = FRAMES[:, -1, SPARSE_DIM:][..., ROTATION].unflatten(-1, (N_JOINTS, 6))
-    errors = train_sage.measure_half(net, UPPER, true[:, list(UPPER)], FRAMES[:, -1], true)
+    errors = train_sage.measure_half_errors(net, UPPER, true[:, list(UPPER)], FRAMES[:, -1], true)
     assert {name: round(float(value), 6) for name, value in errors.items()} == dict.fromkeys(errors, 0.0)
     turned = true.clone()
     turned[:, HEAD] = turned[:, HEAD].roll(3, -1)  # joints hang on the head's tracker, and none on the head
-    found = train_sage.measure_half(net, UPPER, turned[:, list(UPPER)], FRAMES[:, -1], true)
+    found = train_sage.measure_half_errors(net, UPPER, turned[:, list(UPPER)], FRAMES[:, -1], true)
     assert float(found["rotation"]) > 0.01
     assert float(found["position"]) == pytest.approx(0, abs=1e-6)
     assert float(found["hand"]) == pytest.approx(0, abs=1e-6)
@@ -125,14 +125,14 @@ def test_the_lower_half_is_given_what_the_upper_one_samples():
     """Never the true latents, which there are none of at inference."""
     net, codes = parts("lower_diffusion")
     encoded = net.normalizer.encode(FRAMES)[..., :SPARSE_DIM]
-    net.lower.join = Watched(net.lower.join)
+    net.lower.merge_latents = Watched(net.lower.merge_latents)
     with torch.no_grad():
         for training in (True, False):
             train_sage.compute_latent_losses(net, codes, FRAMES, training, lower=True)
         net.predict_rotations(encoded)
         expected = net.sample_upper(encoded)
-    assert len(net.lower.join.calls) == 1 + 2 * len(net.diffusion.times)
-    assert all(torch.equal(upper, expected) for _, upper in net.lower.join.calls)
+    assert len(net.lower.merge_latents.calls) == 1 + 2 * len(net.diffusion.times)
+    assert all(torch.equal(upper, expected) for _, upper in net.lower.merge_latents.calls)
 
 
 def test_the_whole_is_trained_through_both_samplers():
@@ -146,7 +146,7 @@ def test_the_whole_is_trained_through_both_samplers():
 
 def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
     kept = tiny.baseline("sage", seed=1)
-    checkpoint.write(tmp_path / "model", checkpoint.module_tensors("model", kept), {})
+    checkpoint.write(tmp_path / "model", checkpoint.collect_module_tensors("model", kept), {})
     network = partial(tiny.build_baseline, "sage")
     architecture = Architecture(
         World(), normalize=False, vqvae=tiny.vqvae, network=lambda *of: network(of[0])

@@ -37,7 +37,7 @@ from memmlp.live.wearer import compute_body_height
 from memmlp.motion.body import FPS, FRAME_DIM, JOINTS, PARENTS, TRACKED
 from memmlp.motion.limb_shapes import HEAT, LIMBS
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
-from memmlp.networks.streaming import has_stream, streaming
+from memmlp.networks.streaming import has_streaming_graph, streaming
 
 ABOUT = "site.json"
 SPACE = SPACES["openxr"]  # the frame of reference of all poses on the site
@@ -218,7 +218,9 @@ def write_network(folder: Path, network: SiteNetwork, bench: bool) -> Entry:
     if network.run != RANDOM:
         with tempfile.TemporaryDirectory() as temporary:
             path = Path(temporary) / "whole.onnx"
-            export_full(streaming(model) if has_stream(model) else model, path, network.run, SPACE.name)
+            export_full(
+                streaming(model) if has_streaming_graph(model) else model, path, network.run, SPACE.name
+            )
             played = _write_file(folder, f"networks/{network.key}.onnx.gz", path.read_bytes())
     rest = model.normalizer.rest.double().numpy()
     return {
@@ -252,7 +254,7 @@ def write_graphs(folder: Path, network: SiteNetwork) -> Iterator[Entry]:
         [0.1 * torch.randn(60, FRAME_DIM)],
     )  # the ranges of int8 do not affect the time
     graphs: dict[str, MotionModel | StreamingGraph] = {"naive": model}
-    if has_stream(model):
+    if has_streaming_graph(model):
         graphs["streaming"] = streaming(model)
     with tempfile.TemporaryDirectory() as temporary:
         step, whole, lowered = (Path(temporary) / f"{name}.onnx" for name in ("step", "whole", "lower"))

@@ -1,4 +1,4 @@
-"""Losses of baselines as in their released codes, and the empty one of networks that bring their own."""
+"""The baselines' losses, as in their released code, and an empty loss for networks with their own losses."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from memmlp.common.components import component
 from memmlp.common.settings import at_least, one_of, setting
 from memmlp.motion.body import N_JOINTS, ROOT, ROTATION
 from memmlp.motion.normalizer import Normalizer
-from memmlp.training.losses.loss import CompleteLossSettings, Fixed, Loss, Terms, joints, read_weights
+from memmlp.training.losses.loss import CompleteLossSettings, FixedWeights, Loss, Terms, joints, read_weights
 from memmlp.training.losses.terms import Comparison
 
 ERRORS: dict[str, Callable[[Tensor], Tensor]] = {
     "norm": lambda error: error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean(),
     "square": lambda error: error.square().mean(),
 }
-"""How AGRoL's 6D errors (..., 132) become a number."""
+"""Functions that reduce AGRoL's 6D errors (..., 132) to a number."""
 
 ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {
     "pelvis": lambda positions: positions - positions[..., ROOT : ROOT + 1, :],
     "head": lambda positions: positions,
 }
-"""How joint positions (..., 22, 3), whose head is on its tracker, are anchored before they are compared."""
+"""Functions that anchor joint positions (..., 22, 3) for comparison; the head is on its tracker."""
 
 
 @component("loss", "agrol", builds="AGRoLLoss")
 @dataclass
 class AGRoLLossSettings(CompleteLossSettings):
-    """AGRoL's loss (Du et al. 2023); Mem-MLP can have it with predictor=rotation_only and hand=off."""
+    """AGRoL's loss (Du et al. 2023); Mem-MLP can use it with predictor=rotation_only and hand=off."""
 
     # norm: the mean over frames and joints of the 6D error's norm, as in the released code; square: the mean
     # squared error
@@ -41,19 +41,19 @@ class AGRoLLossSettings(CompleteLossSettings):
 
 
 class AGRoLLoss(Loss):
-    """AGRoL's error of the 6D rotations, in network space, as is the diffusion model's noise.
+    """AGRoL's error of the 6D rotations in network space.
 
-    The error "norm" is that with which its released code trains both networks; "square" is a possible reading
-    of its paper (Du et al. 2023, L2).
+    The released code trains both networks with the error "norm". "square" is a possible reading of the paper
+    (Du et al. 2023, L2).
     """
 
     def __init__(self, settings: AGRoLLossSettings | None = None):
         super().__init__()
         self.error = ERRORS[(settings or AGRoLLossSettings()).error]
-        self.weighting = Fixed({"rotation_all": 1.0})
+        self.weighting = FixedWeights({"rotation_all": 1.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the one term, from motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
+        """Return the rotation term for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         origin = normalizer.origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         return {"rotation_all": self.error(error[..., ROTATION])}
@@ -62,7 +62,7 @@ class AGRoLLoss(Loss):
 @component("loss", "avatar_poser", builds="AvatarPoserLoss")
 @dataclass
 class AvatarPoserLossSettings(CompleteLossSettings):
-    """AvatarPoser's loss, of mean absolute errors (Jiang et al. 2022)."""
+    """AvatarPoser's loss: mean absolute errors (Jiang et al. 2022)."""
 
     # weight of the root's orientation: the released code's; its paper has 0.05
     orientation: float = setting(at_least(0), 0.02)
@@ -76,14 +76,14 @@ class AvatarPoserLossSettings(CompleteLossSettings):
 class AvatarPoserLoss(Loss):
     """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
 
-    The positions follow by forward kinematics. The mean is over the 22 joints; the authors' mean includes the
-    fingers, which move with the wrists.
+    The positions come from forward kinematics. The mean is over the 22 joints; the authors' mean also
+    includes the fingers, which move with the wrists.
     """
 
     def __init__(self, settings: AvatarPoserLossSettings | None = None):
         super().__init__()
         settings = settings or AvatarPoserLossSettings()
-        self.weighting, self.anchored = Fixed(read_weights(settings)), ANCHORS[settings.anchor]
+        self.weighting, self.anchored = FixedWeights(read_weights(settings)), ANCHORS[settings.anchor]
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         error = (motion - truth)[..., ROTATION].abs()
@@ -95,23 +95,24 @@ class AvatarPoserLoss(Loss):
         }
 
 
-def joint_sums(error: Tensor) -> Tensor:
+def sum_joint_errors(error: Tensor) -> Tensor:
     """Return the L1 norm of each joint's error (B, T, 22 n), averaged over frames and joints."""
     return error.unflatten(-1, (N_JOINTS, -1)).abs().sum(-1).mean()
 
 
-def joint_sums_of_steps(error: Tensor) -> Tensor:
-    """Return the same of an error's steps between frames; the last frame counts as right."""
+def sum_step_errors(error: Tensor) -> Tensor:
+    """Return `sum_joint_errors` of the error's frame-to-frame changes, with 0 for the last frame."""
     frames = error.shape[1]
-    return joint_sums(error.diff(dim=1)) * (frames - 1) / frames
+    return sum_joint_errors(error.diff(dim=1)) * (frames - 1) / frames
 
 
 @component("loss", "rpm", builds="RPMLoss")
 @dataclass
 class RPMLossSettings(CompleteLossSettings):
-    """RPM's loss (CVPR 2025, released code): L1 norms of the joints' errors, and of their steps.
+    """RPM's loss (CVPR 2025, released code): L1 norms of joint errors and of their velocities.
 
-    Rotations are as the network sees them, positions by forward kinematics with the head on its tracker.
+    Rotations are compared in network space. Positions come from forward kinematics with the head on its
+    tracker.
     """
 
     rotation_all: float = setting(at_least(0), 1.0)
@@ -121,15 +122,15 @@ class RPMLossSettings(CompleteLossSettings):
 
 
 class RPMLoss(Loss):
-    """L1 norms of joints' errors in rotations and positions, and in how both move (CVPR 2025, released code).
+    """RPM's L1 norms of joint errors: rotations, positions and their velocities (CVPR 2025, released code).
 
-    Rotations are compared in network space, so as z-scores where the network has them; positions by forward
-    kinematics with the head on its tracker, metres in the world.
+    Rotations are compared in network space, which may have z-scores. Positions are in world metres, from
+    forward kinematics with the head on its tracker.
     """
 
     def __init__(self, settings: RPMLossSettings | None = None):
         super().__init__()
-        self.weighting = Fixed(read_weights(settings or RPMLossSettings()))
+        self.weighting = FixedWeights(read_weights(settings or RPMLossSettings()))
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         origin = normalizer.origin(sparse)
@@ -137,32 +138,32 @@ class RPMLoss(Loss):
         rotations, pair = error[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
         positions = (pair.positions - pair.true_positions).flatten(-2)
         return {
-            "rotation_all": joint_sums(rotations),
-            "rotation_velocity": joint_sums_of_steps(rotations),
-            "world_position": joint_sums(positions),
-            "velocity": joint_sums_of_steps(positions),
+            "rotation_all": sum_joint_errors(rotations),
+            "rotation_velocity": sum_step_errors(rotations),
+            "world_position": sum_joint_errors(positions),
+            "velocity": sum_step_errors(positions),
         }
 
 
 @component("loss", "of_network", builds="LossOfNetwork")
 @dataclass
 class LossOfNetworkSettings(CompleteLossSettings):
-    """Only the network's own loss, for networks that can train with it: BoDiffusion."""
+    """An empty motion loss, for networks that can train with their own losses: BoDiffusion."""
 
 
 class LossOfNetwork(Loss):
-    """No loss of the motion: a network trains with its own losses alone (`TrainingOutputs.losses`)."""
+    """An empty motion loss: the network trains only with its own losses (`TrainingOutputs.losses`)."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.weighting = Fixed({})
+        self.weighting = FixedWeights({})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return no terms."""
+        """Return an empty dict."""
         return {}
 
     def forward(
         self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
     ) -> tuple[Tensor, Terms]:
-        """Return 0 and no terms."""
+        """Return 0 and an empty dict."""
         return motion.new_zeros(()), {}

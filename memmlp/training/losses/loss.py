@@ -24,14 +24,14 @@ def joints(motion: Tensor) -> Tensor:
 
 
 def read_weights(settings: Settings) -> dict[str, float]:
-    """Return the settings that are numbers, by name: the weights of a loss without other numbers."""
+    """Return the numeric settings by name, which are the weights of a loss."""
     return {name: value for name, value in asdict(settings).items() if not isinstance(value, str)}
 
 
-@component("loss", "manual", builds="Manual")
+@component("loss", "manual", builds="ManualWeights")
 @dataclass
 class ManualSettings(Settings):
-    """Mem-MLP's loss terms with fixed weights, which the paper found by grid search (Sec. 4.4, reading 8)."""
+    """Mem-MLP's loss terms with fixed weights, from the paper's grid search (Sec. 4.4)."""
 
     rotation_all: float = setting(at_least(0), 1.0)
     rotation_velocity: float = setting(at_least(0), 30.0)
@@ -40,10 +40,10 @@ class ManualSettings(Settings):
     hand: float = setting(at_least(0), 0.1)
 
 
-@component("loss", "uncertainty", builds="Uncertainty")
+@component("loss", "uncertainty", builds="UncertaintyWeights")
 @dataclass
 class UncertaintySettings(Settings):
-    """Mem-MLP's loss terms weighted by homoscedastic uncertainty (Eq. 5, reading 8).
+    """Mem-MLP's loss terms weighted by homoscedastic uncertainty (Eq. 5; docs/readings.md, no. 8).
 
     A term counts as e^-s L + s, with one learned s for each term.
     """
@@ -54,19 +54,19 @@ class UncertaintySettings(Settings):
 
 @dataclass
 class CompleteLossSettings(Settings):
-    """The settings of a complete loss, which networks without slots need; others only weight Mem-MLP's terms.
+    """Settings of a complete loss, which networks without slots need.
 
     Attributes:
         complete: whether the loss is complete.
-        rotations_alone: whether it only compares rotations, so that Mem-MLP with a rotation branch can have
-        it.
+        rotations_alone: whether the loss only compares rotations. If so, Mem-MLP with only a rotation branch
+            can use it.
     """
 
     complete: ClassVar[bool] = True
     rotations_alone: ClassVar[bool] = False
 
 
-class Fixed(nn.Module):
+class FixedWeights(nn.Module):
     """Fixed weights of the loss terms, by the terms' names."""
 
     def __init__(self, values: Mapping[str, float]):
@@ -74,19 +74,19 @@ class Fixed(nn.Module):
         self.values = values
 
     def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
-        """Check that every term has a weight, adding the weights of custom terms; there is nothing to learn.
+        """Add the weights of custom terms, and check that every term has a weight.
 
-        Where a custom term has the name of a weight that no term uses, its own weight replaces that one.
+        A custom term may reuse the name of an unused weight. Its own weight then replaces the unused weight.
 
         Raises:
-            InputError: for a term that has no weight.
+            InputError: if a term does not have a weight.
         """
         self.values = {**self.values, **(own or {})}
         if lacking := [name for name in names if name not in self.values]:
-            raise InputError(f"loss.{lacking[0]}: must have a weight; known are {', '.join(self.values)}")
+            raise InputError(f"loss.{lacking[0]}: must have a weight, like {', '.join(self.values)}")
 
     def parameter_groups(self) -> list[dict]:
-        """Return no parameters, since there is nothing to learn."""
+        """Return an empty list, because fixed weights are not learned."""
         return []
 
     def forward(self, terms: Terms) -> Tensor:
@@ -98,25 +98,25 @@ class Fixed(nn.Module):
         return self.values
 
 
-class Manual(Fixed):
-    """Fixed weights of the paper's terms (reading 8); by default those of its grid search (Sec. 4.4)."""
+class ManualWeights(FixedWeights):
+    """Fixed weights of the paper's terms (docs/readings.md, no. 8)."""
 
     def __init__(self, settings: ManualSettings | None = None):
         super().__init__(read_weights(settings or ManualSettings()))
 
 
-class Uncertainty(nn.Module):
-    """Weights by homoscedastic uncertainty (Kendall et al. 2018, reading 8): e^-s L + s, with one s per term.
+class UncertaintyWeights(nn.Module):
+    """Weights by homoscedastic uncertainty: e^-s L + s, with one s per term (Kendall et al. 2018).
 
-    A term that is exactly 0, such as penetration where no foot is below the floor, leaves its s as it is: no
-    weight would be largest, and e^-s would grow without bound.
+    A term of exactly 0, such as penetration of feet above the floor, leaves its s unchanged. Otherwise e^-s
+    would grow without bound. See docs/readings.md, no. 8.
 
     Args:
-        lr: learning rate of the s; with the model's learning rate they would settle too slowly.
-        values: the weights to begin with, by the terms' names; after `build` they are 1.
+        lr: learning rate of every s; the model's learning rate would be too low.
+        values: initial weights by the terms' names; `build` resets all weights to 1.
 
     Raises:
-        InputError: for a weight of 0, which e^-s never is.
+        InputError: if a weight is 0, because e^-s is never 0.
     """
 
     def __init__(self, lr: float = 1e-2, values: Mapping[str, float] | None = None):
@@ -128,7 +128,7 @@ class Uncertainty(nn.Module):
         self.s = nn.ParameterDict({name: nn.Parameter(s) for name, s in begin.items()})
 
     def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
-        """Make a parameter s, starting at 0, for each term; `own` has fixed weights and is not used."""
+        """Make a parameter s for each term, initially 0; `own`, the fixed weights, is not used."""
         self.s = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in names})
 
     def parameter_groups(self) -> list[dict]:
@@ -142,11 +142,11 @@ class Uncertainty(nn.Module):
         ).sum()
 
     def weights(self) -> Mapping[str, float]:
-        """Return the present weight e^-s of each term."""
+        """Return the current weight e^-s of each term."""
         return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
 
 
-Weighting = Fixed | Uncertainty
+Weighting = FixedWeights | UncertaintyWeights
 
 
 class Loss(nn.Module):
@@ -155,7 +155,7 @@ class Loss(nn.Module):
     weighting: Weighting
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return each term by name.
+        """Return the loss terms by name.
 
         Args:
             motion: predicted motion (B, T, 198), world.
@@ -170,8 +170,7 @@ class Loss(nn.Module):
     ) -> tuple[Tensor, Terms]:
         """Return the loss and its unweighted terms; the arguments are those of `terms`.
 
-        The loss is computed in float32, whatever the motion's precision: velocities and jerk are small
-        differences.
+        The loss is computed in float32, because velocities and jerk are small differences.
         """
         with in_float32(truth.device):
             terms = self.terms(motion.to(truth.dtype), truth, sparse, normalizer)

@@ -1,8 +1,8 @@
-"""Mem-MLP's loss: Eqs. 1-4 and the hand term, put together with a weighting (Eq. 5).
+"""Mem-MLP's loss: Eqs. 1-4 and the hand term, combined by a weighting (Eq. 5).
 
-The paper's terms are taken as printed: L1, summed over joints and components, mean over time and batch
-(reading 10). Everything is in the world: rotations in 6D components, positions in metres, and velocities in
-either per frame.
+The paper's terms are implemented as printed: L1, summed over joints and components, averaged over time and
+batch (docs/readings.md, no. 10). All values are in world coordinates: rotations in 6D components, positions
+in metres, velocities per frame.
 """
 
 from __future__ import annotations
@@ -24,67 +24,68 @@ from memmlp.training.losses.loss import Loss, Terms, Weighting, joints
 
 
 def l1(error: Tensor) -> Tensor:
-    """Return the sum of an error's (B, T, ...) absolute values over components, mean over batch and time."""
+    """Return the L1 norm of an error (B, T, ...), summed over components, averaged over batch and time."""
     return error.abs().flatten(2).sum(-1).mean()
 
 
 @component("hand", "off")
-class NoHand:
-    """The choice to have no hand term."""
+class NoHandTerm:
+    """An empty hand term, for losses without one."""
 
     branch = "position"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return no term."""
+        """Return an empty dict."""
         return {}
 
 
-@component("hand", "position", builds="HandPosition")
+@component("hand", "position", builds="PositionHandTerm")
 @dataclass
-class HandPositionSettings(Settings):
-    """The hand term compares the wrists' positions of the position branch (reading 9)."""
+class PositionHandTermSettings(Settings):
+    """A hand term that compares the position branch's wrists (docs/readings.md, no. 9)."""
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield whether the predictor has no positions; see Settings."""
+        """Yield a problem if the predictor does not have positions; see Settings."""
         if not getattr(find_chosen_settings(config, "predictor"), "positions", True):
             yield f"hand=position: must be fk or off with predictor={config['predictor']['name']}"
 
 
-class HandPosition:
-    """The hand term as L1 on both wrists' positions in the position branch (reading 9)."""
+class PositionHandTerm:
+    """The hand term: L1 of both wrists' positions in the position branch (docs/readings.md, no. 9)."""
 
     branch = "position"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the hand term, from motion and truth (B, T, 198)."""
+        """Return the hand term for motion and truth (B, T, 198)."""
         hands = list(HANDS)
         return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
 
 
 @component("hand", "fk")
-class HandFK:
-    """The hand term as L1 on both wrists' positions by forward kinematics of the rotation branch.
+class KinematicHandTerm:
+    """The hand term: L1 of both wrists' positions from the rotation branch, by forward kinematics.
 
-    The head of the predicted body is put on its tracker.
+    The predicted head is placed on its tracker.
     """
 
     branch = "rotation"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the hand term, from motion and truth (B, T, 198) and inputs (B, T, 54), all in the world."""
+        """Return the hand term for motion and truth (B, T, 198) and inputs (B, T, 54), all in the world."""
         hands = list(HANDS)
         return {"hand": l1(normalizer.pose(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])}
 
 
-Hand = NoHand | HandPosition | HandFK
+Hand = NoHandTerm | PositionHandTerm | KinematicHandTerm
 
 
 class Term:
-    """A custom term of the loss; the interface of the slot `term`. This base class adds none.
+    """The interface of the slot `term`: a custom loss term. This base class does not add a term.
 
     Args:
-        weight: the term's weight with fixed weights (`loss=manual`); uncertainty weighting learns one.
+        weight: the term's weight with fixed weights (`loss=manual`); uncertainty weighting learns its own
+            weight.
 
     Attributes:
         branch: the branch that the term compares; a network without this branch does not have the term.
@@ -96,21 +97,21 @@ class Term:
         self.weight = weight
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the term by its name, for motion and truth (B, T, 198) and inputs (B, T, 54), world."""
+        """Return the term by name for motion and truth (B, T, 198) and inputs (B, T, 54), world."""
         return {}
 
 
 class MotionLoss(Loss):
-    """Mem-MLP's loss (Eq. 5), with the terms of those branches that the predictor has.
+    """Mem-MLP's loss (Eq. 5), with the terms for the predictor's branches.
 
     Args:
-        weighting: Manual or Uncertainty.
+        weighting: ManualWeights or UncertaintyWeights.
         hand: the hand term.
         branches: the predictor's branches.
-        term: one more, custom term.
+        term: an additional custom term.
 
     Raises:
-        InputError: if two terms have the same name, or a term has no weight.
+        InputError: if two terms have the same name, or a term does not have a weight.
     """
 
     def __init__(self, weighting: Weighting, hand: Hand, branches: frozenset[str], term: Term | None = None):
@@ -122,21 +123,25 @@ class MotionLoss(Loss):
         normalizer = Normalizer.raw(World(), torch.zeros(N_JOINTS, 3))
         motion = probe[..., SPARSE_DIM:]
         probed = motion, motion, probe[..., :SPARSE_DIM], normalizer
-        own = dict.fromkeys(self._own(*probed), self.term.weight)
-        if twice := own.keys() & self._paper(*probed).keys():
-            raise InputError(f"term: '{min(twice)}' must have another name, since the loss has such a term")
+        own = dict.fromkeys(self._compute_custom_term(*probed), self.term.weight)
+        if twice := own.keys() & self._compute_paper_terms(*probed).keys():
+            raise InputError(f"term: '{min(twice)}' must have another name, since this name is in use")
         weighting.build(list(self.terms(*probed)), own)
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        paper = self._paper(motion, truth, sparse, normalizer)
-        return paper | self._own(motion, truth, sparse, normalizer)
+        paper = self._compute_paper_terms(motion, truth, sparse, normalizer)
+        return paper | self._compute_custom_term(motion, truth, sparse, normalizer)
 
-    def _own(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+    def _compute_custom_term(
+        self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
+    ) -> Terms:
         """Return the custom term, if the network has the branch that it compares."""
         given = self.term.branch in self.branches
         return self.term(motion, truth, sparse, normalizer) if given else {}
 
-    def _paper(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+    def _compute_paper_terms(
+        self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
+    ) -> Terms:
         """Return the paper's terms and the hand term."""
         terms: Terms = {}
         if "rotation" in self.branches:

@@ -1,7 +1,7 @@
-"""A library of loss terms, from which any network's loss can be put together (`TermsLoss`).
+"""A library of loss terms for any network (`TermsLoss`).
 
-All terms compare a predicted body with the true one in the world, in metres, and in metres per frame for
-velocities.
+All terms compare a predicted body with the true body in the world. Positions are in metres, velocities in
+metres per frame.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from memmlp.motion.geometry import forward_kinematics, geodesic_angle, matrix_to
 from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import (
     CompleteLossSettings,
-    Fixed,
+    FixedWeights,
     Loss,
     Terms,
-    Uncertainty,
+    UncertaintyWeights,
     Weighting,
     joints,
 )
 
 FEET = (7, 8, 10, 11)  # both ankles, both toes
 TOES = (10, 11)
-STANDING = 0.01  # metres a frame, up to which a true foot stands
+MAX_STANDING_MOVE = 0.01  # metres a frame, up to which a true foot stands
 
 
-class Body:
-    """A body at each frame; values that several terms need are computed once, when first used.
+class BodyMotion:
+    """A body's pose at each frame, with cached values that several terms need.
 
     Args:
-        motion: world motion (B, T, 198), of which only the rotations are used.
-        normalizer: has the rest pose.
+        motion: world motion (B, T, 198); only its rotations are used.
+        normalizer: provides the rest pose.
     """
 
     def __init__(self, motion: Tensor, normalizer: Normalizer):
@@ -54,7 +54,7 @@ class Body:
         return sixd_to_matrix(self.sixd)
 
     @cached_property
-    def posed(self) -> tuple[Tensor, Tensor]:
+    def global_pose(self) -> tuple[Tensor, Tensor]:
         """Global rotations (B, T, 22, 3, 3), and positions (B, T, 22, 3) with the pelvis at the origin."""
         return forward_kinematics(self.local, torch.zeros_like(self.local[..., ROOT, :, 0]), self.rest)
 
@@ -76,15 +76,15 @@ ERRORS: dict[str, Error] = {
 
 
 class Comparison:
-    """A predicted motion and the true one, to be compared.
+    """A predicted motion compared with the true motion.
 
-    Each weight of TermsLossSettings has a method of its name, which returns the term.
+    Each weight of TermsLossSettings has a method with the same name, which returns the term.
 
     Args:
         motion: predicted world motion (B, T, 198).
         truth: true world motion (B, T, 198).
         sparse: world inputs (B, T, 54).
-        normalizer: has the rest pose.
+        normalizer: provides the rest pose.
 
     Attributes:
         positions: predicted joints (B, T, 22, 3), with the head on its tracker.
@@ -92,14 +92,14 @@ class Comparison:
     """
 
     def __init__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer):
-        self.made, self.true = Body(motion, normalizer), Body(truth, normalizer)
+        self.predicted, self.truth = BodyMotion(motion, normalizer), BodyMotion(truth, normalizer)
         self.head = sparse[..., SPARSE_POSITION][..., None, :3]
         self.true_positions = joints(truth)
 
     @cached_property
     def positions(self) -> Tensor:
         """The predicted joints (B, T, 22, 3), with the head on its tracker."""
-        rooted = self.made.posed[1]
+        rooted = self.predicted.global_pose[1]
         return rooted + (self.head - rooted[..., HEAD : HEAD + 1, :])
 
     @cached_property
@@ -109,40 +109,42 @@ class Comparison:
 
     @cached_property
     def standing(self) -> Tensor:
-        """Which of the true feet stand (B, T - 1, 4): those that hardly move to the next frame."""
-        return self.true_positions[:, :, list(FEET)].diff(dim=1).norm(dim=-1) <= STANDING
+        """Whether each true foot stands still until the next frame (B, T - 1, 4)."""
+        return self.true_positions[:, :, list(FEET)].diff(dim=1).norm(dim=-1) <= MAX_STANDING_MOVE
 
     def orientation(self, error: Error) -> Tensor:
         """Return the error of the root's 6D orientation."""
-        return error((self.made.sixd - self.true.sixd)[..., ROOT, :])
+        return error((self.predicted.sixd - self.truth.sixd)[..., ROOT, :])
 
     def rotation(self, error: Error) -> Tensor:
-        """Return the error of the other joints' local 6D rotations."""
-        return error((self.made.sixd - self.true.sixd)[..., ROOT + 1 :, :])
+        """Return the error of the local 6D rotations of all joints except the root."""
+        return error((self.predicted.sixd - self.truth.sixd)[..., ROOT + 1 :, :])
 
     def global_rotation(self, error: Error) -> Tensor:
         """Return the error of all joints' global 6D rotations."""
-        return error(matrix_to_sixd(self.made.posed[0]) - matrix_to_sixd(self.true.posed[0]))
+        return error(
+            matrix_to_sixd(self.predicted.global_pose[0]) - matrix_to_sixd(self.truth.global_pose[0])
+        )
 
     def angle(self, error: Error) -> Tensor:
         """Return the mean angle between predicted and true global rotations, in radians."""
-        return geodesic_angle(self.made.posed[0], self.true.posed[0]).mean()
+        return geodesic_angle(self.predicted.global_pose[0], self.truth.global_pose[0]).mean()
 
     def sixd_velocity(self, error: Error) -> Tensor:
         """Return the error of the frame-to-frame differences of all local 6D rotations."""
-        return error((self.made.sixd - self.true.sixd).diff(dim=1))
+        return error((self.predicted.sixd - self.truth.sixd).diff(dim=1))
 
     def turn(self, error: Error) -> Tensor:
         """Return the error of the joints' velocities on SO(3): the rotations from frame to frame, in 6D."""
-        return error(matrix_to_sixd(self.made.turns) - matrix_to_sixd(self.true.turns))
+        return error(matrix_to_sixd(self.predicted.turns) - matrix_to_sixd(self.truth.turns))
 
     def position_from_pelvis(self, error: Error) -> Tensor:
-        """Return the error of the joints by forward kinematics from the pelvis, without translation."""
+        """Return the error of joint positions relative to the pelvis, from forward kinematics."""
         true = self.true_positions - self.true_positions[..., ROOT : ROOT + 1, :]
-        return error(self.made.posed[1] - true)
+        return error(self.predicted.global_pose[1] - true)
 
     def world_position(self, error: Error) -> Tensor:
-        """Return the error of the joints by forward kinematics, with the head on its tracker."""
+        """Return the error of joint positions from forward kinematics, with the head on its tracker."""
         return error(self.positions - self.true_positions)
 
     def hand(self, error: Error) -> Tensor:
@@ -187,18 +189,18 @@ TERM_FRAMES = {
     "sixd_velocity": 2, "turn": 2, "velocity": 2, "velocity_3": 4, "velocity_5": 6, "acceleration": 3,
     "jerk": 4, "contact": 2, "foot_height": 2,
 }  # fmt: skip
-"""How many frames the terms need that need several."""
+"""The number of frames for each term that needs more than one frame."""
 
 
 @component("loss", "terms", builds="TermsLoss")
 @dataclass
 class TermsLossSettings(CompleteLossSettings):
-    """Terms of a library, each with a weight; null leaves a term out.
+    """A weighted sum of loss terms from a library; null leaves a term out.
 
-    Options such as loss=ego_poser and loss=hmd_poser are choices of them.
+    Options such as loss=ego_poser and loss=hmd_poser are presets of these weights.
 
-    A network that learns one frame of a window (AvatarPoser, EgoPoser, MANIKIN) cannot have the terms over
-    several.
+    A network that learns only one frame of a window (AvatarPoser, EgoPoser, MANIKIN) cannot use terms that
+    need several frames.
     """
 
     # of differences: absolute components, square, norm (of joints), smooth (Huber's, as torch's smooth L1)
@@ -239,12 +241,12 @@ class TermsLossSettings(CompleteLossSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield which terms need more frames than the network learns of a window; see Settings."""
+        """Yield the terms that need more frames than the network learns of a window; see Settings."""
         newest = getattr(find_chosen_settings(config, "model"), "learns_newest_frame", False)
         frames = 1 if newest else config["model"]["frames"]
         for name, needed in TERM_FRAMES.items():
             if config["loss"].get(name) is not None and frames < needed:
-                yield f"loss.{name}: must be null, since it needs {needed} frames and there are {frames}"
+                yield f"loss.{name}: must be null, since it needs {needed} frames, but model learns {frames}"
 
 
 TERMS = tuple(one.name for one in fields(TermsLossSettings) if one.type == "float | None")
@@ -252,7 +254,7 @@ TERMS = tuple(one.name for one in fields(TermsLossSettings) if one.type == "floa
 
 
 class TermsLoss(Loss):
-    """A weighted sum of the library's terms; most baselines' losses are such sums.
+    """A weighted sum of the library's terms, used by most baselines.
 
     Args:
         error, weighting, lr: see TermsLossSettings.
@@ -268,9 +270,11 @@ class TermsLoss(Loss):
         super().__init__()
         chosen = {name: weight for name, weight in weights.items() if weight is not None}
         if not chosen:
-            raise InputError(f"loss=terms: needs a weight for at least one of {', '.join(TERMS)}")
+            raise InputError(f"loss=terms: must have a weight for at least one of {', '.join(TERMS)}")
         self.error = ERRORS[error]
-        self.weighting: Weighting = Uncertainty(lr, chosen) if weighting == "learned" else Fixed(chosen)
+        self.weighting: Weighting = (
+            UncertaintyWeights(lr, chosen) if weighting == "learned" else FixedWeights(chosen)
+        )
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         pair = Comparison(motion, truth, sparse, normalizer)
