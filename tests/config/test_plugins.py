@@ -179,7 +179,7 @@ from memmlp.common.settings import MetricSettings, Settings, setting
 def test_wrong_declarations_are_one_line(folder: Path):
     metric = '@component("metric", "A")\nclass ASettings'
     for number, (text, line) in enumerate((
-        ('@component("memory", "gru")\nclass Mine: pass\n', "memory=gru: "),
+        ('@component("memory", "gru")\nclass Mine: pass\n', "memory=gru exists already"),
         ('@component("metric", "MPJPE")\nclass S(MetricSettings): smallest = 1\n', "metric MPJPE: "),
         (f"{metric}(MetricSettings): smallest = 0\n", "metric A: "),
         (f'{metric}(MetricSettings): smallest, better = 1, "more"\n', "metric A: better"),

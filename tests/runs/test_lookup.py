@@ -49,7 +49,7 @@ def test_a_bare_folder_name_is_found_and_an_ambiguous_beginning_lists_the_runs(t
     runs = [Run.from_id(tmp_path, "ab" + digit * 14) for digit in "01"]
     for run in runs:
         run.begin("memmlp", {}, data="d", prerequisite=None)
-    with pytest.raises(InputError, match=r"2 ids .*: ab0+, ab1+"):
+    with pytest.raises(InputError, match=r"2 run ids .*: ab0+, ab1+"):
         find_run(tmp_path, "ab")
     monkeypatch.chdir(runs[0].folder.parent)
     assert find_run("outputs", runs[0].id).folder == runs[0].folder.resolve()
