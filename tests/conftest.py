@@ -125,17 +125,17 @@ def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def step_files(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The files of streaming steps by the name of the network (tests/exported.py), each exported once."""
+def step_files(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Files of networks (tests/exported.py), each exported once: the step, or the full graph in a space."""
     folder = shared(tmp_path_factory, "steps")
 
-    def step_file(name: str) -> Path:
-        path = folder / f"{name}.onnx"
+    def step_file(name: str, space: str | None = None) -> Path:
+        path = folder / f"{name}-{space or 'step'}.onnx"
         with FileLock(f"{path}.lock"):
             if not path.exists():
                 import exported
 
-                exported.write(name, path)
+                exported.write(name, path, space)
         return path
 
     return step_file

@@ -36,13 +36,18 @@ LARGEST: dict[str, Callable[[], MotionModel]] = {"manikin_l": partial(tiny.basel
 """Exported for one test only (tests/networks/test_networks.py), since that takes seconds."""
 
 
-def write(name: str, path: Path) -> None:
-    """Export a network's streaming step."""
+def write(name: str, path: Path, space: str | None = None) -> None:
+    """Export a network's streaming step, or the full graph in a space."""
     # Imported here, since they take seconds to import and most test files need neither.
     from memmlp.deploy.export import export
+    from memmlp.live.trackers_to_body_graph import export_full
     from memmlp.networks.streaming import streaming
 
-    export(streaming((NETWORKS | LARGEST)[name]()), path, "0123456789abcdef")
+    stream = streaming((NETWORKS | LARGEST)[name]())
+    if space:
+        export_full(stream, path, "0123456789abcdef", space)
+    else:
+        export(stream, path, "0123456789abcdef")
 
 
 DATA_DEPENDENT = {

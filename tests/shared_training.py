@@ -17,12 +17,12 @@ from memmlp.training.loop import TrainingTask, train
 from memmlp.training.optim import Muon, Optim, ScheduleFree
 from memmlp.training.train_network import VQVAETask
 
-STEPS = replace(OPTIM, steps=24, checkpoint_every=10, validate_every=12)
+STEPS = replace(OPTIM, steps=14, checkpoint_every=6, validate_every=7)
 OPTIMS = {
     "muon": Muon(**asdict(replace(STEPS, ema=0.9))),
     "schedule_free": ScheduleFree(**asdict(STEPS)),
 }
-DEATH = 14  # the step at which the second process dies
+DEATH = 9  # the step at which the second process dies
 
 
 def optim_of(name: str) -> Optim:

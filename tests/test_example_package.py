@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 from command_line import MAIN, run, run_apart
-from own_package import EXAMPLE, KILLED, PACKAGE, TINY
+from own_package import EXAMPLE, PACKAGE, TINY
 from processes import finished
 
 from memmlp.runs.lookup import list_runs
 
+QUICK = [*TINY, "optim.steps=6"]
 OWN = [f"plugins=[{PACKAGE}]", "experiment=feet"]
 
 
@@ -21,7 +22,7 @@ OWN = [f"plugins=[{PACKAGE}]", "experiment=feet"]
 def test_every_command_takes_custom_components(
     on_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    assert "FootSkate" in run(tmp_path, "train", *OWN, *KILLED)
+    assert "FootSkate" in run(tmp_path, "train", *OWN, *QUICK)
     (made,) = list_runs(tmp_path / "outputs")
     assert made.results["latency"]["graph"] == "naive"
     assert made.manifest["plugins"][PACKAGE]["version"] == "0.1.0"
@@ -32,7 +33,7 @@ def test_every_command_takes_custom_components(
     assert (tmp_path / "step.onnx").exists()
 
     # one variant of the sweep is the run above
-    sweep = [shutil.copy(EXAMPLE / "feet.yaml", tmp_path), *KILLED, "export.graph=off"]
+    sweep = [shutil.copy(EXAMPLE / "feet.yaml", tmp_path), *QUICK, "export.graph=off"]
     assert "2 of 2 runs done" in run(tmp_path, "sweep", *sweep, "executor=debug")
     assert len(list_runs(tmp_path / "outputs")) == 2
     assert "FootSkate" in json.dumps(json.loads(run(tmp_path, "table", *sweep, "--format", "json")))
@@ -42,7 +43,7 @@ def test_every_command_takes_custom_components(
     # workers import the package, too
     space = "+search.space.term.weight={low: 0.01, high: 1.0, log: true}"
     search = ["search.objectives=[FootSkate]", space, "search.n_trials=1"]
-    tuned = run_apart(tmp_path, "tune", *OWN, *TINY, "optim.steps=6", *search, "--workers", "1")
+    tuned = run_apart(tmp_path, "tune", *OWN, *QUICK, *search, "--workers", "1")
     assert "1 of 1 trials: 1 complete" in tuned
 
     # without the package

@@ -60,15 +60,9 @@ def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, networ
     assert set(inner) == {onnx.TensorProto.INT8}
     ends = {
         "mem_mlp": {"model.stem.weight", "model.predictor.rotation.linear.weight"},
-        "avatar_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
-        "ego_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
-        "hmd_poser": {"model.model.pose.0.weight"},
         "manikin_s": {f"model.model.{head}.0.weight" for head in ("swivel", "places", "rotation")},
         "avatar_jlm": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
-        "bodiffusion": {"model.sparse.weight", "model.motion.weight", "model.made.weight"},
-        "sage": {"model.sparse.weight", "model.decoder.heads.0.2.weight", "model.decoder.heads.1.2.weight"},
-        "vae_hmd": {"model.model.encoder.stem.weight", "model.model.decoder.head.weight"},
-    }.get(network, {"model.model.head.weight"})
+    }[network]
     assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import exported
 import numpy as np
 import pytest
 import wearer
@@ -44,16 +43,15 @@ def trackers(space: str) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def played(
-    tmp_path_factory: pytest.TempPathFactory, step_files: Callable[[str], Path]
+    tmp_path_factory: pytest.TempPathFactory, step_files: Callable[..., Path]
 ) -> Callable[[str], Played]:
     """A clip of trackers through a tiny network, by the name of the space."""
     folder = shared(tmp_path_factory, "engines")
 
     def play(space: str) -> Played:
-        network, path = folder / f"{space}.onnx", folder / f"{space}.csv"
-        with FileLock(f"{network}.lock"):
-            if not network.exists():
-                export(network, space)
+        network, path = step_files("mem_mlp", space), folder / f"{space}.csv"
+        with FileLock(f"{path}.lock"):
+            if not path.exists():
                 runpy.run_path(str(EXAMPLES / "trackers.py"))["write"](path, trackers(space))
         there = SPACES[space]
         given = (
@@ -63,11 +61,3 @@ def played(
         return Played(network, path, wearer.play(Stream(step_files("mem_mlp"), space=space), *given))
 
     return play
-
-
-def export(path: Path, space: str) -> None:
-    """Export the full graph from trackers to joints."""
-    from memmlp.live.trackers_to_body_graph import export_full  # it takes seconds to import
-    from memmlp.networks.streaming import streaming
-
-    export_full(streaming(exported.NETWORKS["mem_mlp"]()), path, "0123456789abcdef", space)

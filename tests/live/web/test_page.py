@@ -184,7 +184,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     browser.value(f"document.querySelector('#height').value = {100 * height}")
     browser.resolved("headset.pull()")
     browser.resolved(f"headset.play([tPose], offsets, () => {SITE}.calibrated)")
-    browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")
+    browser.resolved(f"headset.play({json.dumps(joints()[:120])}, offsets)")
     browser.resolved("headset.session.end()")
     choose = "s.value = 'other'; s.dispatchEvent(new Event('change'))"
     browser.value(f"(s => {{ {choose} }})(document.querySelector('#content select'))")
@@ -215,7 +215,7 @@ def check_wearer(recording: dict[str, Any], site: Made) -> None:
             made = np.array(sample["positions"]).reshape(-1, 3)
             apart.append(np.linalg.norm(made - pose.positions, axis=1).max())
         assert list(pose.held) == sample["held"]
-    assert len(apart) > 80
+    assert len(apart) > 40
     assert max(apart) <= TOLERANCE, max(apart)
 
 
@@ -241,6 +241,7 @@ def check_bench(browser: Browser, file: Path) -> None:
     """The bench's rows are such as Table 17 takes."""
     go(browser, "bench", f"{SITE}.bench == 'ready'")
     browser.value("document.querySelector('#device').value = 'Test headset'")
+    browser.value("document.querySelector('#steps').replaceChildren(new Option('few', 40))")
     browser.value("document.querySelector('#start').click()")
     browser.wait(f"{SITE}.bench == 'done' || document.querySelector('#start').textContent == 'Start'")
     assert "Measured 8 rows" in browser.value("document.querySelector('#progress').textContent")
@@ -251,5 +252,5 @@ def check_bench(browser: Browser, file: Path) -> None:
     kinds = [(row["network"], row["graph"], row["precision"]) for row in measured.rows]
     graphs = [("naive", "fp32"), ("streaming", "fp32"), ("streaming", "int8"), ("streaming", "fp16")]
     assert kinds == [(name, *graph) for name in ("AvatarPoser", "tiny") for graph in graphs]
-    assert {row["steps"] for row in measured.rows} == {500}
+    assert {row["steps"] for row in measured.rows} == {40}
     assert [row["whole_median_ms"] is not None for row in measured.rows] == [True, True, False, True] * 2
