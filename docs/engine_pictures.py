@@ -18,8 +18,8 @@ from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES, Space
 from memmlp.motion.body import JOINTS, PARENTS, TRACKED, builtin_rest_joints
 from memmlp.motion.limb_shapes import RADII
-from memmlp.report.pictures.drawing import Camera, draw_skeleton, encode_png, fix_layout, make_panels
-from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT, colour_of
+from memmlp.report.pictures.drawing import Camera, draw_skeleton, encode_png, freeze_layout, make_panels
+from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT, find_joint_colour
 
 IMAGES = Path(__file__).parent / "images"
 COLOURS = ("#d1242f", "#1a7f37", "#0969da")  # of X, Y and Z
@@ -104,7 +104,7 @@ def engines() -> Figure:
     for panel, engine in zip(panels.flat, ENGINES, strict=True):
         hand = "right-handed" if engine.right_handed else "left-handed"
         panel.set_title(f"{engine.name}\n{hand}, {engine.words}")
-    fix_layout(figure)
+    freeze_layout(figure)
     for panel, engine in zip(panels.flat, ENGINES, strict=True):
         view = View(panel, joints, camera_on(joints))
         view.axes(joints[0] * [1, 1, 0] + 0.75 * FORWARD, np.array(engine.axes), 0.42)
@@ -116,7 +116,7 @@ def identities() -> Figure:
     figure, panels = make_panels(3 * WIDTH, HEIGHT, 1, 3)
     for panel, name in zip(panels.flat, SPACES, strict=True):
         panel.set_title(f"{name}\n{LIES[name]}")
-    fix_layout(figure)
+    freeze_layout(figure)
     for panel, space in zip(panels.flat, SPACES.values(), strict=True):
         joints = TREE.compute_positions(rooted(space, np.eye(3)))
         joints = joints - [0, 0, (joints[:, 2] - np.array(RADII)).min()]
@@ -152,7 +152,7 @@ def trackers() -> Figure:
     figure, panels = make_panels(1140, 580, 1, 2)
     for panel, title in zip(panels.flat, words, strict=True):
         panel.set_title(title)
-    fix_layout(figure)
+    freeze_layout(figure)
     for panel, local in zip(panels.flat, (still, posed), strict=True):
         joints, turns = standing(local), global_turns(local)
         view = View(panel, joints, camera_on(joints, metres=2.3))
@@ -176,7 +176,7 @@ def t_pose() -> Figure:
     figure, panels = make_panels(1160, 694, 1, 3)
     right, front, left = panels.flat
     front.set_xlabel("from the front: the person's left is on the right; ○ has a tracker")
-    fix_layout(figure)
+    freeze_layout(figure)
     for panel, start, width in ((right, 0, 0.2), (front, 0.16, 0.66), (left, 0.84, 0.16)):
         panel.set_position((start, 0.06, width, 0.94))
     view = View(front, joints, camera_on(joints, np.pi, 2.0))
@@ -184,10 +184,12 @@ def t_pose() -> Figure:
         x, y = view.place(point)
         if joint in TRACKED:
             front.plot(x, y, "o", ms=16, mfc="none", color="black")
-        front.plot(x, y, "o", ms=5, color=colour_of(JOINTS[joint]))
+        front.plot(x, y, "o", ms=5, color=find_joint_colour(JOINTS[joint]))
         front.annotate(str(joint), (x, y), (6, 6), textcoords="offset points", weight="bold")
     for panel, top, shown in ((right, 0.9, RIGHT), (left, 0.9, LEFT), (left, 0.4, MIDDLE)):
-        for row, joint in enumerate(one for one in range(len(JOINTS)) if colour_of(JOINTS[one]) == shown):
+        for row, joint in enumerate(
+            one for one in range(len(JOINTS)) if find_joint_colour(JOINTS[one]) == shown
+        ):
             panel.text(0.05, top - 0.04 * row, f"{joint}  {JOINTS[joint]}", color=shown)
     return figure
 

@@ -19,7 +19,7 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Offsets
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.runs.evaluation_file import COMBINED
 from memmlp.runs.lookup import check_trained, find_run, is_trained, list_runs
 from memmlp.runs.run import Run
@@ -150,7 +150,7 @@ class TrainedRun(os.PathLike[str]):
         """
         return {
             mode: {branch: _numbers(errors) for branch, errors in branches.items()}
-            for mode, branches in sorted(load(self.folder).means.items())
+            for mode, branches in sorted(load_measured_run(self.folder).means.items())
         }
 
     @property
@@ -243,12 +243,12 @@ class TrainedRun(os.PathLike[str]):
         return open_found(self._run)
 
     def _rows(self) -> Iterator[dict[str, Any]]:
-        measured, combined_by = load(self.folder), self.combined_by
+        measured, combined_by = load_measured_run(self.folder), self.combined_by
         for mode, branches in sorted(measured.means.items()):
             for branch in branches:
                 by = combined_by.get(mode) if branch == COMBINED else None
                 for clip, modes in measured.clips.items():
-                    facts = {"clip": clip, "group": measured.group(clip), "frames": modes[mode]["frames"]}
+                    facts = {"clip": clip, "group": measured.get_group(clip), "frames": modes[mode]["frames"]}
                     about = {"run": self.id, "seed": self.seed, "mode": mode, "branch": branch}
                     yield about | {"combined_by": by} | facts | _numbers(modes[mode][branch])
 
@@ -315,13 +315,13 @@ class Prediction:
             InputError: for another kind of file, a folder that does not exist, another branch, a piece
                 without frames, a number of poses out of range, or an MP4 without PyAV installed.
         """
-        from memmlp.report.pictures.clip_pictures import check_picture, frame_range, write_picture
+        from memmlp.report.pictures.clip_pictures import check_picture_path, find_frame_range, write_picture
 
         file = Path(path)
-        check_picture(file)
+        check_picture_path(file)
         if poses not in range(1, 21):
             raise InputError(f"poses {poses}: must be 1 to 20")
-        first, last = frame_range(len(self), self.clip, begin, end)
+        first, last = find_frame_range(len(self), self.clip, begin, end)
         write_picture(file, self._piece(branch, first, last), poses)
         return file
 

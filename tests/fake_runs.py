@@ -16,7 +16,7 @@ import numpy as np
 
 from memmlp.report.tables.build_table import find_finished_runs, make_table
 from memmlp.report.tables.effects import RunsBySeed
-from memmlp.report.tables.measured_run import Measured, load
+from memmlp.report.tables.measured_run import MeasuredRun, load_measured_run
 from memmlp.report.tables.table import Table
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES, Sweep, Variant
@@ -100,10 +100,12 @@ def fake_sweep(
     return find
 
 
-def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -> dict[str, RunsBySeed]:
+def runs_of(
+    sweep: Sweep, find: Find, read: Callable[[Path], MeasuredRun] = load_measured_run
+) -> dict[str, RunsBySeed]:
     """The finished runs."""
 
-    def measured(variant: Variant, seed: int) -> Measured | None:
+    def measured(variant: Variant, seed: int) -> MeasuredRun | None:
         run = find(variant, seed)
         return read(run.folder) if run is not None and run.done else None
 

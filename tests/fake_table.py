@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from memmlp.report.tables.table import Table
-from memmlp.report.tables.table_text import show
+from memmlp.report.tables.table_text import print_table
 
 SHIPPED = Path(__file__).parent.parent / "sweeps"
 FILE = {
@@ -34,5 +34,5 @@ def cell(table: Table, label: str, metric: str, mode: str = "stream"):
 
 def printed(table: Table, width: int) -> str:
     console = Console(width=width, markup=False, highlight=False, file=io.StringIO())
-    show(table, console)
+    print_table(table, console)
     return console.file.getvalue()  # type: ignore[attr-defined]

@@ -76,9 +76,9 @@ def render(
     from memmlp.common.errors import InputError
     from memmlp.common.progress import announce
     from memmlp.config.open_run import open_run
-    from memmlp.report.pictures.clip_pictures import check_picture, write_picture
+    from memmlp.report.pictures.clip_pictures import check_picture_path, write_picture
 
-    check_picture(out, "--out")
+    check_picture_path(out, "--out")
     if labels and len(labels) != len(runs):
         raise InputError(f"--label: {len(labels)} for {len(runs)} runs; give one for each run, or no label")
     opened = [open_run(outputs, run) for run in runs]
@@ -107,11 +107,11 @@ def _predict_piece(
     from memmlp.common.progress import announce
     from memmlp.config.open_run import clip_of
     from memmlp.evaluation.predictions import predict_clip
-    from memmlp.report.pictures.clip_pictures import ClipPiece, frame_range
+    from memmlp.report.pictures.clip_pictures import ClipPiece, find_frame_range
 
     first_run = next(iter(runs.values()))
     title = clip or first_run.test.names[0]
-    first, last = frame_range(len(clip_of(first_run.test, title)), title, begin, end, ("--from", "--to"))
+    first, last = find_frame_range(len(clip_of(first_run.test, title)), title, begin, end, ("--from", "--to"))
     truths, predictions = [], {}
     for label, run in runs.items():
         announce(f"render: {label} on {title}")

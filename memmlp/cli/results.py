@@ -21,7 +21,7 @@ from memmlp.cli.options import (
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
-    from memmlp.report.kept_results import Kept
+    from memmlp.report.kept_results import KeptResults
     from memmlp.report.result_pages import KeptTable
     from memmlp.report.tables.table import Table
 
@@ -62,14 +62,20 @@ def save_command(
     from memmlp.cli.table import shown_sweep
     from memmlp.common.files import make_json_safe
     from memmlp.config.compose_plan import find_sweep, is_path
-    from memmlp.report.kept_results import Kept, list_overrides, load_kept, save, shorten_paths
+    from memmlp.report.kept_results import (
+        KeptResults,
+        list_overrides,
+        load_kept_results,
+        save_results,
+        shorten_paths,
+    )
     from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
-    from memmlp.report.tables.measured_run import load
+    from memmlp.report.tables.measured_run import load_measured_run
 
     sweep = find_sweep(name, overrides)
     shown = shown_sweep(sweep, overrides, outputs.absolute())
     runs, flags = (
-        find_finished_runs(shown.sweep, make_run_finder(shown.plan, functools.cache(load))),
+        find_finished_runs(shown.sweep, make_run_finder(shown.plan, functools.cache(load_measured_run))),
         shown.flags,
     )
     if untrained:
@@ -77,7 +83,7 @@ def save_command(
 
         runs, more_flags = with_costs(shown.sweep, runs)
         flags = (*flags, *more_flags)
-    kept = Kept(
+    kept = KeptResults(
         name if is_path(name) else sweep.name,
         shorten_paths(word for word in overrides if not word.startswith("seed=")),
         runs,
@@ -85,16 +91,16 @@ def save_command(
         make_json_safe(asdict(shown.rounds)) if shown.rounds else None,
         flags,
     )
-    if not kept.every:
+    if not kept.all_runs:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
     path = out / f"{stem or sweep.name}.json"
     if path.exists():
         try:
-            kept.check_replaces(load_kept(path))
+            kept.check_can_replace(load_kept_results(path))
         except InputError as error:
             raise InputError(f"{path}: {error}; give another --name or --out, or remove the file") from None
-    save(path, kept)
-    click.echo(f"{path}: {kept.count} runs")
+    save_results(path, kept)
+    click.echo(f"{path}: {kept.run_count} runs")
 
 
 folder_option = click.option(
@@ -114,13 +120,13 @@ folder_option = click.option(
 def show(name: str, source: str | None, together: tuple[str, ...], folder: Path) -> None:
     """Print the table of kept results, without any run; NAME is that of their page."""
     from memmlp.cli.table import print_tables
-    from memmlp.report.kept_results import load_kept
+    from memmlp.report.kept_results import load_kept_results
 
     path = folder / "data" / f"{name}.json"
     if not path.is_file():
         known = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
         raise InputError(f"{path}: no such results; must be one of: {known or '(none are kept)'}")
-    print_tables([_make_table(load_kept(path), source, together)])
+    print_tables([_make_table(load_kept_results(path), source, together)])
 
 
 @results.command("docs")
@@ -156,21 +162,21 @@ def docs(folder: Path, check: bool) -> None:
 
 def make_tables(folder: Path) -> dict[str, KeptTable]:
     """Return the tables of all results kept below a folder, by the stems of their files."""
-    from memmlp.report.kept_results import load_kept
+    from memmlp.report.kept_results import load_kept_results
     from memmlp.report.result_pages import KeptTable
 
     if not (folder / "data").is_dir():
         raise InputError(f"{folder}/data: no such folder; memmlp results save --out {folder}/data makes it")
     found = {}
     for path in sorted((folder / "data").glob("*.json")):
-        kept = load_kept(path)
+        kept = load_kept_results(path)
         sources = () if kept.rounds else kept.sources  # rounds decide verdicts of all clips together
         by_source = tuple(_make_table(kept, source) for source in sources)
         found[path.stem] = KeptTable(kept, _make_table(kept), by_source, partial(_make_table, kept, None))
     return found
 
 
-def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
+def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
     """Compute the table of kept results, over the sweep's seeds and all further ones of their runs.
 
     Args:
@@ -180,30 +186,30 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
     """
     from memmlp.cli.table import flag_of_other_rounds
     from memmlp.config.compose_plan import find_sweep
-    from memmlp.report.tables.build_table import make_table, restrict_clips
+    from memmlp.report.tables.build_table import make_table, restrict_and_group_clips
     from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.runs.identity import list_outdated
 
     # With the command line's overrides, the table warns of other data than its own.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)
     flags: list[str] = []
-    rounds = Rounds.of_json(kept.rounds) if kept.rounds else None
+    rounds = Rounds.from_json(kept.rounds) if kept.rounds else None
     other = flag_of_other_rounds(rounds, sweep) if rounds else None
     if rounds and not other:
         if source or patterns:
             raise InputError("--source, --together: need a fixed number of seeds, not rounds")
-        spent = rounds.spent(sweep)
+        spent = rounds.restrict_sweep(sweep)
         table = make_table(
-            spent, kept.runs_of(spent), command=f"{kept.command} --until-decided", rounds=rounds
+            spent, kept.select_runs(spent), command=f"{kept.command} --until-decided", rounds=rounds
         )
     else:
         # Seeds of the definition without a kept run are missing: one seed of five is not a finished table.
         seeds = sorted({*sweep.seeds, *(seed for by_seed in kept.runs.values() for seed in by_seed)})
         sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
-        sweep, runs, restricted = restrict_clips(sweep, kept.runs_of(sweep), source, patterns)
+        sweep, runs, restricted = restrict_and_group_clips(sweep, kept.select_runs(sweep), source, patterns)
         flags = [*restricted, *([other] if other else [])]
         table = make_table(sweep, runs, command=kept.command)
-    changed = sorted({change for run in kept.every for change in list_outdated(run.origin.every_version)})
+    changed = sorted({change for run in kept.all_runs for change in list_outdated(run.origin.every_version)})
     flags += [
         *kept.flags,
         *([f"made with earlier component versions: {', '.join(changed)}"] if changed else []),

@@ -81,7 +81,7 @@ def sweep(
     labels = chosen.labels_of(variants)
     outputs = outputs.absolute()
     rounds = current_rounds(chosen, outputs, max_seeds) if until_decided else None
-    spent = rounds.spent(chosen) if rounds else chosen
+    spent = rounds.restrict_sweep(chosen) if rounds else chosen
     plan = make_plan(spent, outputs, prepare=not (status or dry_run))
     wanted = plan.of_variants(labels)
     if status or dry_run:
@@ -99,7 +99,7 @@ def sweep(
     given = [name, *overrides]
     if rounds:
         rounds, plan = run_until_decided(chosen, outputs, rounds, work)
-        show_outcome(ShownSweep(rounds.spent(chosen), plan, rounds), given, chosen, labels)
+        show_outcome(ShownSweep(rounds.restrict_sweep(chosen), plan, rounds), given, chosen, labels)
         return
     if wanted.left():
         work(chosen, wanted)
@@ -202,12 +202,12 @@ def show_outcome(shown: ShownSweep, given: Sequence[str], chosen: Sweep, labels:
     from memmlp.config import plugins
     from memmlp.config.compose_plan import sweep_folder
     from memmlp.report.tables.build_table import write_table
-    from memmlp.report.tables.measured_run import load
+    from memmlp.report.tables.measured_run import load_measured_run
 
     plan, rounds, command = shown.plan, shown.rounds, " ".join([*given, *plugins.config_dir_words()])
     states = plan.states()
     failed = [task for task in plan.of_variants(labels).tasks if states[task.key] in ("failed", "blocked")]
-    found = table_of_plan(shown, SHOWN_MODES["both"], f"memmlp sweep {command}", load)
+    found = table_of_plan(shown, SHOWN_MODES["both"], f"memmlp sweep {command}", load_measured_run)
     write_table(found.table, sweep_folder(chosen, plan.outputs))
     print_tables([found.table])
     for line in describe_end(rounds, chosen) if rounds else ():
@@ -226,12 +226,12 @@ def check_rounds_options(overrides: Sequence[str], wanted: bool, most: int | Non
     """Raise InputError for options of --until-decided that don't go together."""
     if most is None and not wanted:
         return  # SciPy takes long to import
-    from memmlp.report.tables.seed_rounds import MOST
+    from memmlp.report.tables.seed_rounds import MAX_SEEDS
     from memmlp.report.tables.statistics import make_schedule
 
     if most is not None and not wanted:
         raise InputError("--max-seeds: needs --until-decided")
-    if most is not None and most < (first := make_schedule(MOST)[0]):
+    if most is not None and most < (first := make_schedule(MAX_SEEDS)[0]):
         raise InputError(f"--max-seeds {most}: must be at least {first}, the seeds of the first analysis")
     for override in overrides:
         if wanted and override.startswith("seed="):
@@ -251,16 +251,16 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
         InputError: if the analyses were of a sweep that has changed since, or with another maximum.
     """
     from memmlp.cli.table import rounds_path
-    from memmlp.report.tables.seed_rounds import MOST, Rounds, start_rounds
+    from memmlp.report.tables.seed_rounds import MAX_SEEDS, Rounds, start_rounds
 
     path = rounds_path(sweep, outputs)
     kept = Rounds.read(path)
     if kept is None or not kept.analyses:
-        return start_rounds(sweep, most or MOST)
+        return start_rounds(sweep, most or MAX_SEEDS)
     wanted = start_rounds(sweep, most or len(kept.seeds))
     if len(wanted.seeds) != len(kept.seeds):
         raise InputError(f"--max-seeds {most}: must be {len(kept.seeds)}, as in the rounds of {path}")
-    if other := kept.difference(wanted):
+    if other := kept.find_difference(wanted):
         raise InputError(f"{path}: its interim analyses were of other {other}; remove it to restart them")
     return kept
 
@@ -281,7 +281,7 @@ def run_until_decided(
     from memmlp.report.tables.seed_rounds import check_same_runs
 
     while True:
-        spent = rounds.spent(sweep)
+        spent = rounds.restrict_sweep(sweep)
         plan = make_plan(spent, outputs, prepare=True)
         check_same_runs(rounds, sweep, plan, rounds_path(sweep, outputs))
         if plan.left():
@@ -304,20 +304,22 @@ def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     from memmlp.common.files import write_json
     from memmlp.common.lease import Lock
     from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
-    from memmlp.report.tables.measured_run import load
-    from memmlp.report.tables.seed_rounds import Rounds, advance, digest_runs
+    from memmlp.report.tables.measured_run import load_measured_run
+    from memmlp.report.tables.seed_rounds import Rounds, digest_runs, do_next_analysis
 
     path = rounds_path(sweep, outputs)
     with Lock(path.parent).hold():
         kept = Rounds.read(path)
         if kept is not None and len(kept.analyses) > len(rounds.analyses):
             return kept
-        runs: dict[str, RunsBySeed] = find_finished_runs(rounds.spent(sweep), make_run_finder(plan, load))
+        runs: dict[str, RunsBySeed] = find_finished_runs(
+            rounds.restrict_sweep(sweep), make_run_finder(plan, load_measured_run)
+        )
         digests = {
             label: digest_runs(rounds, sweep, plan, label, rounds.schedule[number])
-            for label, number in rounds.upcoming(sweep).items()
+            for label, number in rounds.find_next_analyses(sweep).items()
         }
-        after = advance(rounds, sweep, runs, digests)
+        after = do_next_analysis(rounds, sweep, runs, digests)
         write_json(path, asdict(after))
     return after
 
@@ -334,22 +336,22 @@ def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None
     for one in variants:
         following = f"at {one.next}" if one.next else ""
         rows.append((one.label, str(one.decided), str(one.inconclusive), str(one.seeds), following))
-    count = f"{head}{decided} of {len(rounds.comparisons(sweep))} comparisons decided"
+    count = f"{head}{decided} of {len(rounds.list_comparison_keys(sweep))} comparisons decided"
     return [count, *(line.rstrip() for line in aligned(rows, left=len(rows[0])))]
 
 
 def describe_end(rounds: Rounds, sweep: Sweep) -> list[str]:
     """Say why the rounds ended, and how many runs were spent."""
-    latest = [finding for finding, _ in rounds.latest().values()]
+    latest = [finding for finding, _ in rounds.find_latest().values()]
     still = [finding for finding in latest if finding.verdict == "inconclusive"]
     analysed = {label for one in rounds.analyses for label in one.runs}
     without = sorted(analysed - {finding.label for finding in latest})
-    lines = [] if still or without or rounds.upcoming(sweep) else ["all verdicts are decided"]
+    lines = [] if still or without or rounds.find_next_analyses(sweep) else ["all verdicts are decided"]
     if without:
         lines.append(f"no verdict, as the runs have nothing to compare: {', '.join(without)}")
     if any(finding.p is None for finding in still):
         lines.append("test clips are one group, or a network diverged on one: no number of seeds decides")
-    used, variants = sum(rounds.seed_counts(sweep).values()), len(sweep.runnable())
+    used, variants = sum(rounds.count_seeds(sweep).values()), len(sweep.runnable())
     last = max((one.seeds for one in rounds.analyses), default=rounds.schedule[0])
     fixed = [
         f"{variants * seeds} with {seeds} seeds for every variant"

@@ -22,7 +22,7 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.report.tables.build_table import Read
+    from memmlp.report.tables.build_table import ReadRun
     from memmlp.report.tables.effects import RunsBySeed
     from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.report.tables.table import Table
@@ -97,13 +97,15 @@ def table(
     OVERRIDES are those that the sweep was run with; they find its runs again.
     """
     from memmlp.report.tables import rows_measured_in_browsers
-    from memmlp.report.tables.measured_run import load
+    from memmlp.report.tables.measured_run import load_measured_run
 
-    measured = [rows_measured_in_browsers.read(path) for path in add]
+    measured = [rows_measured_in_browsers.read_bench(path) for path in add]
     selection = TableSelection(branch, source, together, untrained)
     gc.disable()  # what is read from the runs stays in use, and searching it for garbage takes a second
     try:
-        found = gather(name, overrides, outputs, SHOWN_MODES[mode], functools.cache(load), selection)
+        found = gather(
+            name, overrides, outputs, SHOWN_MODES[mode], functools.cache(load_measured_run), selection
+        )
     finally:
         gc.enable()
     if seeds_needed:
@@ -165,7 +167,7 @@ def gather(
     overrides: Sequence[str],
     outputs: Path,
     modes: Sequence[str],
-    read: Read,
+    read: ReadRun,
     selection: TableSelection = WHOLE,
 ) -> list[SweepTable]:
     """Gather the tables with a name.
@@ -178,7 +180,7 @@ def gather(
         overrides: the command line's overrides.
         outputs: the folder of runs and caches.
         modes: modes of evaluation to show.
-        read: reads a run (`memmlp.report.tables.measured_run.load`).
+        read: reads a run (`memmlp.report.tables.measured_run.load_measured_run`).
         selection: what of the results is shown.
 
     Raises:
@@ -212,7 +214,7 @@ def table_of_plan(
     shown: ShownSweep,
     modes: Sequence[str],
     command: str,
-    read: Read,
+    read: ReadRun,
     selection: TableSelection = WHOLE,
 ) -> SweepTable:
     """Return a planned sweep's finished runs, and the table of a part of their results."""
@@ -221,7 +223,7 @@ def table_of_plan(
         make_run_finder,
         make_state_finder,
         make_table,
-        restrict_clips,
+        restrict_and_group_clips,
     )
 
     sweep, plan, rounds, flags = shown
@@ -234,7 +236,7 @@ def table_of_plan(
 
         runs, measured = with_costs(sweep, runs)
         flags = (*flags, *measured)
-    sweep, runs, restricted = restrict_clips(sweep, runs, selection.source, selection.together)
+    sweep, runs, restricted = restrict_and_group_clips(sweep, runs, selection.source, selection.together)
     flags = (*restricted, *flags)
     command = f"{command} --until-decided" if rounds else command
     table = make_table(sweep, runs, modes, command, make_state_finder(plan), rounds)
@@ -257,11 +259,11 @@ def print_tables(tables: Sequence[Table]) -> None:
     """Print tables in the width of the screen."""
     from rich.console import Console
 
-    from memmlp.report.tables.table_text import show
+    from memmlp.report.tables.table_text import print_table
 
     console = Console(highlight=False, markup=False)
     for one in tables:
-        show(one, console)
+        print_table(one, console)
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:
@@ -333,7 +335,7 @@ def shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownS
     seeds_given = any(override.startswith("seed=") for override in overrides)
     if flag := flag_of_other_rounds(kept, sweep, seeds_given):
         return ShownSweep(sweep, make_plan(sweep, outputs), None, (flag,))
-    spent = kept.spent(sweep)
+    spent = kept.restrict_sweep(sweep)
     plan = make_plan(spent, outputs)
     try:
         check_same_runs(kept, sweep, plan, path)
@@ -349,7 +351,7 @@ def flag_of_other_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) 
     """
     from memmlp.report.tables.seed_rounds import start_rounds
 
-    other = "seeds" if seeds_given else kept.difference(start_rounds(sweep, len(kept.seeds)))
+    other = "seeds" if seeds_given else kept.find_difference(start_rounds(sweep, len(kept.seeds)))
     if other is None:
         return None
     return f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"

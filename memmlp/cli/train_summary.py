@@ -13,7 +13,13 @@ from rich.text import Text
 
 from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.evaluation.metric_facts import UNITS
-from memmlp.report.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, load
+from memmlp.report.tables.measured_run import (
+    CORE_SHARES,
+    SAME_ERROR_TOLERANCE,
+    SHARED_METRIC,
+    Errors,
+    load_measured_run,
+)
 from memmlp.runs.deployment_folder import (
     INT8_PRECISIONS,
     MAX_GROWTH,
@@ -89,8 +95,11 @@ def _differing(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return the branches whose positions differ: those of a network that predicts rotations alone don't."""
     differing: list[str] = []
     for branch in (branch for branch in BRANCHES if branch in branches):
-        own = branches[branch][SHARED]
-        if not any(math.isclose(own, branches[other][SHARED], rel_tol=SAME) for other in differing):
+        own = branches[branch][SHARED_METRIC]
+        if not any(
+            math.isclose(own, branches[other][SHARED_METRIC], rel_tol=SAME_ERROR_TOLERANCE)
+            for other in differing
+        ):
             differing.append(branch)
     return differing
 
@@ -145,7 +154,7 @@ def source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:
         run: the run.
         stages: the identities of the evaluations that are shown.
     """
-    for source, measured in load(run.folder, stages).by_source().items():
+    for source, measured in load_measured_run(run.folder, stages).split_by_source().items():
         yield metrics_table(measured.means, f"test clips of {source} ({len(measured.clips)})")
 
 

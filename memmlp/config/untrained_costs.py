@@ -12,7 +12,7 @@ from memmlp.config.build import build_deployment, untrained
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
 from memmlp.report.tables.effects import RunsBySeed
-from memmlp.report.tables.measured_run import Measured, measure_untrained
+from memmlp.report.tables.measured_run import MeasuredRun, measure_untrained
 from memmlp.runs.environment import describe_environment
 from memmlp.sweep.definition import COSTS, SIZES, Sweep
 
@@ -53,7 +53,7 @@ def check_costs(sweep: Sweep) -> None:
         )
 
 
-def measure_costs(overrides: tuple[str, ...], timed: bool) -> Measured:
+def measure_costs(overrides: tuple[str, ...], timed: bool) -> MeasuredRun:
     """Measure the network for some overrides, with random weights, and the ONNX file of its live step.
 
     Args:

@@ -1,1 +1,1 @@
-"""Tables and figures for readers: an HTML page of a project, and pages of kept results."""
+"""Tables, pictures, the HTML page of runs and sweeps, and pages of kept results."""

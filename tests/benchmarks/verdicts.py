@@ -185,9 +185,9 @@ def count(sample: Simulated, shares: Shares) -> SimulatedOutcomes:
     sequential = np.zeros(len(sample.seeds), bool)
     for seeds, level in levels(sample):
         known, mean = sample.mixed(shares, seeds)
-        sequential |= np.abs(mean) > known.half(level / TABLE)
-    half = known.half(LEVEL / TABLE)
-    covered = np.abs(mean) <= known.half(LEVEL)
+        sequential |= np.abs(mean) > known.compute_half_width(level / TABLE)
+    half = known.compute_half_width(LEVEL / TABLE)
+    covered = np.abs(mean) <= known.compute_half_width(LEVEL)
     return SimulatedOutcomes(covered, _any(np.abs(mean) > half), _any(sequential), half - mean)
 
 
@@ -240,7 +240,10 @@ def campaign(sample: Simulated, shares: Shares) -> Campaign:
         seeds[~(differ | same).reshape(tables, VARIANTS, METRICS).all(2)] = number
         known, mean = sample.mixed(shares, number)
         means = mean.reshape(tables, TABLE) + truth
-        p, q = (known.level(d.ravel()).reshape(means.shape) for d in (np.abs(means), MARGIN - np.abs(means)))
+        p, q = (
+            known.compute_level(d.ravel()).reshape(means.shape)
+            for d in (np.abs(means), MARGIN - np.abs(means))
+        )
         now_same = _claimed(q, same, differ, level)
         differ = _claimed(p, differ, now_same, level)
         same = now_same

@@ -91,9 +91,7 @@ def test_a_page_says_that_a_protocol_is_shown_on_other_data(memmlp: Memmlp, plan
     memmlp("results", "save", "2", "data=mocap", "seed=0")
     memmlp("results", "docs")
     page = Path("docs/results/table02.md").read_text().replace("\\", "")
-    assert (
-        "a table of data=amass_s2, shown with data=mocap: its errors do not compare with the paper's" in page
-    )
+    assert "a table of data=amass_s2, shown with data=mocap: errors are not comparable with the paper" in page
 
 
 def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None):

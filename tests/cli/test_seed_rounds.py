@@ -152,11 +152,11 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
     write(VARIANTS)
     assert one_line(memmlp(*SWEEP, "--max-seeds", "8"), "--max-seeds 8: must be 13")
     runs.version = "of other data"
-    assert one_line(memmlp(*SWEEP), "its interim analyses were of other runs of 'worse'")
+    assert one_line(memmlp(*SWEEP), "versions of 'worse' changed since its interim analyses")
     assert record() == before
     runs.version = ""
     Path("outputs/sweeps/trial/rounds.json").write_text("{")
-    assert one_line(memmlp(*SWEEP), "rounds.json: not a record of rounds")
+    assert one_line(memmlp(*SWEEP), "rounds.json: damaged")
 
 
 def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monkeypatch: pytest.MonkeyPatch):

@@ -10,10 +10,10 @@ from fake_runs import fake_run
 
 from memmlp.config.build import untrained
 from memmlp.config.untrained_costs import with_costs
-from memmlp.report.kept_results import Kept
+from memmlp.report.kept_results import KeptResults
 from memmlp.report.result_pages import describe_origin
 from memmlp.report.tables.build_table import make_table
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.sweep.sweep_file import parse_sweep
 
 ARMS = {"Mem-MLP": [], "AvatarPoser": ["model=avatar_poser"], "printed alone": {"overrides": None}}
@@ -23,7 +23,7 @@ SWEEP = parse_sweep("sizes", {"variants": ARMS, "metrics": METRICS, "base": ["pr
 
 @pytest.mark.slow
 def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: Path):
-    run = load(fake_run(tmp_path, "mine", 3).folder)
+    run = load_measured_run(fake_run(tmp_path, "mine", 3).folder)
     runs, flags = with_costs(SWEEP, {"Mem-MLP": {3: run}, "AvatarPoser": {}})
     assert runs["Mem-MLP"] == {3: run}
     assert flags == ("networks that were not trained, with random weights: 'AvatarPoser'",)
@@ -37,7 +37,7 @@ def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: 
     table = make_table(SWEEP, runs)
     assert not [flag for flag in table.flags if "not evaluated" in flag or "missing" in flag]
     (alone, beside) = (
-        describe_origin(Kept("sizes", ("profile=tiny",), found, {}))
+        describe_origin(KeptResults("sizes", ("profile=tiny",), found, {}))
         for found in ({"AvatarPoser": runs["AvatarPoser"]}, runs)
     )
     assert "--untrained" in alone

@@ -18,7 +18,7 @@ from processes import until
 from memmlp.common import lease
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.runs.evaluation_file import is_intact, write_report
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Entry, Plan, RunTask
@@ -220,7 +220,7 @@ def test_results_plans_and_logs_cut_at_every_byte_are_refused(plan: Plan, tmp_pa
     run = fake_run(tmp_path, "arm", clips=("salsa/01",), branches=("rotation",))
     path = run.evaluation("stream-0")
     size = path.stat().st_size
-    assert at_every_byte(path, lambda: load(run.folder).means) == size
+    assert at_every_byte(path, lambda: load_measured_run(run.folder).means) == size
 
     path = tmp_path / "plan.json"
     plan.save(path)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from fake_runs import CLIPS, Find, fake_sweep, runs_of
 
-from memmlp.report.kept_results import Kept, list_overrides
+from memmlp.report.kept_results import KeptResults, list_overrides
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 
@@ -28,5 +28,5 @@ def find(tmp_path_factory: pytest.TempPathFactory) -> Find:
 
 
 @pytest.fixture
-def kept(sweep: Sweep, find: Find) -> Kept:
-    return Kept("table14", ("data=mocap",), runs_of(sweep, find), list_overrides(sweep))
+def kept(sweep: Sweep, find: Find) -> KeptResults:
+    return KeptResults("table14", ("data=mocap",), runs_of(sweep, find), list_overrides(sweep))

@@ -10,15 +10,21 @@ import numpy as np
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.report.kept_results import Kept, dumps, load_kept, save, shorten_paths
+from memmlp.report.kept_results import (
+    KeptResults,
+    format_results,
+    load_kept_results,
+    save_results,
+    shorten_paths,
+)
 from memmlp.report.tables.build_table import make_table
 from memmlp.sweep.definition import Sweep
 
 
-def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Path):
+def test_kept_results_make_the_runs_table(sweep: Sweep, kept: KeptResults, tmp_path: Path):
     """The table is the same to six digits, with every origin and every group."""
-    save(tmp_path / "kept.json", kept)
-    read = load_kept(tmp_path / "kept.json")
+    save_results(tmp_path / "kept.json", kept)
+    read = load_kept_results(tmp_path / "kept.json")
     assert (read.sweep, read.overrides, read.command) == (
         "table14", ("data=mocap",), "memmlp sweep table14 data=mocap",
     )  # fmt: skip
@@ -32,46 +38,48 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Pa
                 if cell.effect:
                     assert again.effect.low == pytest.approx(cell.effect.low, rel=1e-4, abs=1e-4)
                     assert (again.effect.verdict, again.effect.groups) == (cell.effect.verdict, 6)
-    assert [run.origin for run in read.every] == [run.origin for run in kept.every]
+    assert [run.origin for run in read.all_runs] == [run.origin for run in kept.all_runs]
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_a_run_that_diverged_is_kept(sweep: Sweep, kept: Kept, tmp_path: Path, number: float):
+def test_a_run_that_diverged_is_kept(sweep: Sweep, kept: KeptResults, tmp_path: Path, number: float):
     """It is no run less: its variant has no mean, and no other variant's looks better for it."""
     run = kept.runs["2"][1]
     for clip in run.clips:
         run.clips[clip]["stream"]["combined"]["MPJPE"] = number
     run.means["stream"]["combined"]["MPJPE"] = number
-    save(tmp_path / "kept.json", kept)
+    save_results(tmp_path / "kept.json", kept)
     cells = [
         next(row for row in make_table(sweep, one.runs_of(sweep)).rows if row.label == "2").cells["stream"][
             "MPJPE"
         ]
-        for one in (kept, load_kept(tmp_path / "kept.json"))
+        for one in (kept, load_kept_results(tmp_path / "kept.json"))
     ]
     for cell in cells:
         assert sorted(cell.values) == [0, 1, 2]
         assert not np.isfinite(cell.mean)
 
 
-def test_kept_results_that_were_edited_are_rejected(kept: Kept, tmp_path: Path):
-    text = dumps(kept)
+def test_kept_results_that_were_edited_are_rejected(kept: KeptResults, tmp_path: Path):
+    text = format_results(kept)
     number = re.search(r'"MPJPE": \[(\S+),', text)
     (tmp_path / "kept.json").write_text(text.replace(number[1], "9.99", 1))
-    with pytest.raises(InputError, match="edited since it was saved"):
-        load_kept(tmp_path / "kept.json")
+    with pytest.raises(InputError, match="edited by hand"):
+        load_kept_results(tmp_path / "kept.json")
 
 
-def test_kept_results_have_the_same_bytes(kept: Kept, tmp_path: Path):
+def test_kept_results_have_the_same_bytes(kept: KeptResults, tmp_path: Path):
     """The bytes don't depend on the order of the runs, or on being read and written again."""
     turned = {label: dict(reversed(runs.items())) for label, runs in reversed(kept.runs.items())}
-    assert dumps(replace(kept, runs=turned)) == dumps(kept)
-    save(tmp_path / "kept.json", kept)
-    assert dumps(load_kept(tmp_path / "kept.json")) == dumps(kept)
-    assert max(map(len, dumps(kept).splitlines())) < 1000  # a line a list, so that changes can be read
+    assert format_results(replace(kept, runs=turned)) == format_results(kept)
+    save_results(tmp_path / "kept.json", kept)
+    assert format_results(load_kept_results(tmp_path / "kept.json")) == format_results(kept)
+    assert (
+        max(map(len, format_results(kept).splitlines())) < 1000
+    )  # a line a list, so that changes can be read
 
 
-def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp_path: Path):
+def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: KeptResults, tmp_path: Path):
     """Variants may show what two graphs of one training cost, and one of them two evaluations, too."""
     one, two, three = list(kept.runs)[:3]
     slower = {
@@ -82,28 +90,25 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
         seed: replace(run, id=kept.runs[one][seed].id, clip_sources={})
         for seed, run in kept.runs[three].items()
     }
-    save(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: slower, three: solved}))
-    read = load_kept(tmp_path / "kept.json")
+    save_results(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: slower, three: solved}))
+    read = load_kept_results(tmp_path / "kept.json")
     for seed, run in read.runs[one].items():
         assert run.costs["ms"] == pytest.approx(kept.runs[one][seed].costs["ms"])
         assert (run.id, read.runs[two][seed].costs["ms"]) == (read.runs[two][seed].id, 5.0)
         assert read.runs[three][seed].means != run.means
-    assert dumps(read) == (tmp_path / "kept.json").read_text()
+    assert format_results(read) == (tmp_path / "kept.json").read_text()
     flags = make_table(replace(sweep, control=one), read.runs_of(sweep)).flags
     (said,) = (flag for flag in flags if "are one run" in flag)
-    assert (
-        said
-        == f"'{two}' and '{one}' are one run: they differ in how it is deployed, and in nothing but costs"
-    )
+    assert said == f"'{two}' and '{one}' are one run: they differ only in deployment and costs"
 
 
-def test_results_with_further_runs_are_not_replaced(kept: Kept):
+def test_results_with_further_runs_are_not_replaced(kept: KeptResults):
     fewer = replace(kept, runs={label: {0: runs[0]} for label, runs in kept.runs.items()})
-    kept.check_replaces(fewer)
+    kept.check_can_replace(fewer)
     with pytest.raises(InputError, match=r"not here: '2' seed 1, '2' seed 2, '2, 4' seed 1"):
-        fewer.check_replaces(kept)
+        fewer.check_can_replace(kept)
     with pytest.raises(InputError, match="data=synthetic"):
-        kept.check_replaces(replace(kept, overrides=("data=synthetic",)))
+        kept.check_can_replace(replace(kept, overrides=("data=synthetic",)))
 
 
 def test_kept_results_hold_no_path_of_a_machine():
@@ -122,13 +127,13 @@ def test_damaged_results_are_one_line(tmp_path: Path, text: str):
     path = tmp_path / "bad.json"
     path.write_text(text)
     with pytest.raises(InputError, match="memmlp results save"):
-        load_kept(path)
+        load_kept_results(path)
 
 
-def test_results_of_a_variant_with_other_overrides_are_rejected(sweep: Sweep, kept: Kept):
+def test_results_of_a_variant_with_other_overrides_are_rejected(sweep: Sweep, kept: KeptResults):
     """Otherwise its numbers would stand under a label that means something else now."""
     other_two = {"2": ("memory=gru",)}
     variants = [replace(one, overrides=other_two.get(one.label, one.overrides)) for one in sweep.variants]
     other = replace(sweep, variants=tuple(variants))
-    with pytest.raises(InputError, match="variant '2' was made with the overrides"):
-        kept.runs_of(other)
+    with pytest.raises(InputError, match="variant '2': overrides changed from"):
+        kept.select_runs(other)

@@ -16,7 +16,7 @@ from report.conftest import GROUPS
 
 from memmlp.cli.results import make_tables
 from memmlp.common.errors import InputError
-from memmlp.report.kept_results import Kept, list_overrides
+from memmlp.report.kept_results import KeptResults, list_overrides
 from memmlp.report.result_pages import KeptTable, Placeholders, make_pages
 from memmlp.report.tables.build_table import group_clips, make_table
 from memmlp.report.tables.statistics import Verdict, estimate_error
@@ -27,11 +27,11 @@ ROOT = Path(__file__).parent.parent.parent
 DOCS = ROOT / "docs" / "results"
 
 
-def source(sweep: Sweep, kept: Kept) -> KeptTable:
-    return KeptTable(kept, make_table(sweep, kept.runs_of(sweep), command=kept.command))
+def source(sweep: Sweep, kept: KeptResults) -> KeptTable:
+    return KeptTable(kept, make_table(sweep, kept.select_runs(sweep), command=kept.command))
 
 
-def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept: Kept):
+def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept: KeptResults):
     made = source(sweep, kept)
     template = (
         'MPJPE {{ effect("t", "2", "stream", "MPJPE") }}; '
@@ -51,7 +51,7 @@ def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept
     assert "never" not in text
 
 
-def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: Kept):
+def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: KeptResults):
     """Counted anew from the cells; an effect without a sign in the paper is not."""
     made = source(sweep, kept)
     text = make_pages({"t": made}, {"README.md": '{{ held(["t"]) }}\n'})["README.md"]
@@ -66,13 +66,13 @@ def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: Kept)
     assert line == f"| [14](t.md) | 2 | 2, 4, 6, 8 | {' | '.join(words)} |"
 
 
-def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Sweep, kept: Kept):
+def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Sweep, kept: KeptResults):
     """Counted anew from Holm's p-values; the coarser table is the one that the source makes."""
     made = source(sweep, kept)
 
     def coarser(patterns: Sequence[str]):
         assert patterns == ("a", "b")
-        return make_table(sweep, group_clips(kept.runs_of(sweep), ["."])[0])
+        return make_table(sweep, group_clips(kept.select_runs(sweep), ["."])[0])
 
     made = made._replace(regroup=coarser)
     words = '{{ decided("t") }}, {{ decided("t", "a", "b") }}'
@@ -96,7 +96,7 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
         ("{{ effect(", "README.md"),
     ],
 )
-def test_bad_templates_are_one_line(sweep: Sweep, kept: Kept, template: str, words: str):
+def test_bad_templates_are_one_line(sweep: Sweep, kept: KeptResults, template: str, words: str):
     with pytest.raises(InputError, match=re.escape(words)) as raised:
         make_pages({"t": source(sweep, kept)}, {"README.md": template})
     assert str(raised.value).startswith("README.md")
@@ -166,7 +166,7 @@ def by_hand(
         errors = [run["errors"][mode][branches[label]][metric] for run in runs]
         sides.append(np.array(errors)[:, places])
     differences = (sides[0] - sides[1])[None]
-    half = estimate_error(differences, np.array(list(groups.values()))).half(0.05)[0]
+    half = estimate_error(differences, np.array(list(groups.values()))).compute_half_width(0.05)[0]
     return float(differences.mean() - half), float(differences.mean() + half)
 
 
@@ -178,7 +178,7 @@ def test_the_way_from_the_first_variant_to_the_last_is_the_sum_of_its_steps(swee
     chained = replace(sweep, variants=variants, control=labels[0])
     find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
     words = Placeholders(
-        {"t": source(chained, Kept("table14", (), runs_of(chained, find), list_overrides(chained)))}
+        {"t": source(chained, KeptResults("table14", (), runs_of(chained, find), list_overrides(chained)))}
     )
     rows = [line.split(" | ") for line in words.steps("t").splitlines()[2:]]
     assert [row[0].strip("| ") for row in rows] == [
@@ -190,6 +190,6 @@ def test_the_way_from_the_first_variant_to_the_last_is_the_sum_of_its_steps(swee
     assert [part[1] for part in parts[:2]] == ["67 %", "33 %"]  # 1.3 to 1.1 to 1
     assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
     plain = Placeholders(
-        {"t": source(sweep, Kept("table14", (), runs_of(sweep, find), list_overrides(sweep)))}
+        {"t": source(sweep, KeptResults("table14", (), runs_of(sweep, find), list_overrides(sweep)))}
     )
     assert plain.steps("t") == ""

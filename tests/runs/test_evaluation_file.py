@@ -10,7 +10,7 @@ from begun_runs import begun
 import memmlp.runs.identity
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.ui.run_index import read_facts
 from memmlp.runs.evaluation_file import EvaluationsAsConfigured, write_report
 from memmlp.runs.identity import hash_evaluation_settings
@@ -36,7 +36,7 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
     solved(run, "arms", 2.0, made="2")
 
     def found() -> tuple[dict, dict, dict, dict]:
-        read = load(run.folder)
+        read = load_measured_run(run.folder)
         keys = {key: value for key, value in build_record(run).items() if "combined" in key}
         return (
             run.results["stream"]["combined"],
@@ -48,7 +48,7 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
     both = {"MPJPE": 2.0, "of arms": 2.0}
     named = {f"stream.combined-arms.{key}": value for key, value in both.items()}
     assert found() == (both, both, {"stream": "arms"}, named)
-    assert load(run.folder).clips["a"]["stream"]["combined"] == both
+    assert load_measured_run(run.folder).clips["a"]["stream"]["combined"] == both
     run.begin("memmlp", {"evaluation": {"ik": "lbfgs", "ik_iterations": 15}}, data="d", prerequisite=None)
     own = {"MPJPE": 1.0, "of lbfgs": 1.0}
     named = {f"stream.combined-lbfgs-15.{key}": value for key, value in own.items()}

@@ -12,7 +12,7 @@ from begun_runs import CONFIG, begun, complete
 import memmlp.runs.identity
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.ui.run_index import read_facts
 from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import is_intact, write_report
@@ -56,9 +56,9 @@ def test_an_evaluation_of_another_run_or_name_is_refused(tmp_path: Path):
     run, other = complete(tmp_path), complete(tmp_path, CONFIG | {"seed": 1})
     for holder, name in ((run, "stream-1"), (other, "stream-0")):
         shutil.copy(run.evaluation("stream-0"), holder.evaluation(name))
-        load(run.folder, ["stream-0"])
+        load_measured_run(run.folder, ["stream-0"])
         with pytest.raises(InputError, match=rf"evaluations/{name}\.json: cannot be read"):
-            load(holder.folder, [name])
+            load_measured_run(holder.folder, [name])
         assert holder.verify() == [f"evaluations/{name}.json"]
 
 
@@ -100,7 +100,7 @@ def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, gr
     one = build_record(run)
     assert (one["latency.median_ms"], one["latency.onnx_bytes"]) == (1.0, 15)
     assert not [key for key in one if key.startswith("latency-")]
-    assert load(run.folder).costs["ms"] == 1.0
+    assert load_measured_run(run.folder).costs["ms"] == 1.0
     assert read_facts(run.folder)["metrics"]["latency.median_ms"] == 1.0
     assert run.preferred_deployment.settings["graph"] == "auto"
 
@@ -132,7 +132,7 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "metrics", 2)
     monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "graph.naive", 2)
     assert run.results["stream"]["rotation"]["MPJPE"] == 2.0
-    assert load(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
+    assert load_measured_run(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
     assert run.preferred_onnx.read_bytes() == b"new"
 
 

@@ -23,7 +23,7 @@ from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.plugins import packaged
 from memmlp.motion.dataset import MotionDataset
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.runs import environment
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import VERSIONS
@@ -60,7 +60,7 @@ def test_a_run_leaves_everything(home):
     (known,) = run.manifest["prerequisite_runs"]
     assert (known["id"], known["weights"]) == (prerequisite.id, file_digest(prerequisite.model))
     assert known["component_versions"] == prerequisite.manifest["component_versions"]
-    assert load(run.folder).origin.prerequisite_versions["vqvae"] == VERSIONS["vqvae"]
+    assert load_measured_run(run.folder).origin.prerequisite_versions["vqvae"] == VERSIONS["vqvae"]
     with Image.open(run.folder / "poses.png") as picture:
         assert picture.size[0] > 600
         assert len(picture.convert("RGB").getcolors(10**6)) > 50
@@ -71,7 +71,7 @@ def test_a_run_leaves_everything(home):
         "mode.stream": VERSIONS["mode.stream"],
     }
     assert (
-        load(run.folder).origin.component_versions.items()
+        load_measured_run(run.folder).origin.component_versions.items()
         >= {**run.manifest["component_versions"], **report["component_versions"]}.items()
     )
     graph = onnx.load(run.onnx)

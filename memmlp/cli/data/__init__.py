@@ -57,11 +57,11 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
     The clips are spread evenly over the folder's files in the order of their names.
     """
     from memmlp.common.files import atomic_write
-    from memmlp.report.pictures.clip_pictures import check_picture
+    from memmlp.report.pictures.clip_pictures import check_picture_path
     from memmlp.report.pictures.clip_sheet import draw_sheet, read_sample
     from memmlp.report.pictures.drawing import encode_png
 
-    check_picture(out, "--out", (".png",))
+    check_picture_path(out, "--out", (".png",))
     shown, skipped, total = read_sample(source, clips, body)
     show_skipped(skipped)
     atomic_write(out, encode_png(draw_sheet(shown)))

@@ -183,10 +183,10 @@ def show(file: Path, skeleton: str | None, out: Path) -> None:
     from memmlp.motion.importing.convert import view_stance
     from memmlp.motion.importing.recordings import read_recording
     from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
-    from memmlp.report.pictures.clip_pictures import check_picture
+    from memmlp.report.pictures.clip_pictures import check_picture_path
     from memmlp.report.pictures.skeleton_picture import write_skeleton_picture
 
-    check_picture(out, "--out", (".png",))
+    check_picture_path(out, "--out", (".png",))
     recording = read_recording(file)
     skeleton_map = find_skeleton(recording, None if skeleton is None else load_skeleton(skeleton))
     stance = view_stance(recording, skeleton_map, load_rest_joints("builtin"))

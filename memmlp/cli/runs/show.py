@@ -43,7 +43,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
 
     RUN is its id, the beginning of it, or its folder.
     """
-    from memmlp.report.tables.measured_run import load
+    from memmlp.report.tables.measured_run import load_measured_run
     from memmlp.runs.evaluation_file import name_solvers
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import find_run, is_trained
@@ -51,7 +51,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
     found = find_run(outputs, run)
     console().print(_pairs(_summary(found)))
     if is_trained(found):
-        for source, measured in load(found.folder).by_source().items():
+        for source, measured in load_measured_run(found.folder).split_by_source().items():
             means = name_solvers(measured.means, found.evaluations_as_configured.combined_solvers)
             console().print(_pairs(flatten(means), title=f"results on {source}"))
     if found.results:

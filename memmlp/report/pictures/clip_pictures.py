@@ -23,9 +23,9 @@ from memmlp.report.pictures.drawing import (
     Camera,
     draw_skeleton,
     encode_png,
-    fix_layout,
+    freeze_layout,
     get_pixels,
-    heat_colours,
+    make_heat_colours,
     make_panels,
 )
 
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from matplotlib.text import Text
 
 SUFFIXES = (".png", ".gif", ".mp4")
-POSES = 6
-RATE = 30  # pictures a second
-TICKS = (30, 30, 40)  # milliseconds of a GIF's pictures in turn, multiples of 10: 30 a second on average
+POSES = 6  # default number of poses
+RATE = 30  # pictures per second
+TICKS = (30, 30, 40)  # durations of GIF pictures in turn, ms: multiples of 10, on average 30 per second
 BOTTOM = -0.195  # height of a picture's lower edge above the floor, metres
 SIDE = np.deg2rad(25)  # the camera's angle from the person's front, radians
 LOWEST, HIGHEST = 2.15, 2.9  # smallest and largest height that a picture covers, metres
@@ -46,42 +46,42 @@ SCALES = (10, 15, 20, 30, 40, 50, 75, 100)  # the possible tops of a colour scal
 SMOOTHING = 0.2  # seconds over which the camera's path is smoothed
 
 
-def frame_range(
+def find_frame_range(
     length: int, title: str, begin: float, end: float | None, keys: tuple[str, str] = ("begin", "end")
 ) -> tuple[int, int]:
-    """Return the first frame of a piece of a clip, and the frame after its last.
+    """Return the first frame of a piece of a clip, and the frame after its end.
 
     Args:
         length: the clip's number of frames.
         title: the clip's name.
-        begin, end: beginning and end of the piece, seconds; None for the clip's end.
-        keys: the options or arguments that gave begin and end.
+        begin, end: start and end of the piece, seconds; None for the end of the clip.
+        keys: the names of begin and end in messages.
 
     Raises:
-        InputError: if there is no frame between begin and end.
+        InputError: if the piece contains no frame.
     """
     stop = length / FPS if end is None else min(end, length / FPS)
-    if not 0 <= begin < stop or round(begin * FPS) == round(stop * FPS):  # NaN is neither
+    if not 0 <= begin < stop or round(begin * FPS) == round(stop * FPS):  # also true for NaN
         given = f"{keys[0]} {begin:g}" + ("" if end is None else f" {keys[1]} {end:g}")
-        raise InputError(f"{given}: there is no frame between; {title} has {length / FPS:.1f} s")
+        raise InputError(f"{given}: must contain a frame; {title} has {length / FPS:.1f} s")
     return round(begin * FPS), round(stop * FPS)
 
 
-def colour_scale_top(errors: np.ndarray) -> float:
-    """Return the top of a scale for errors in cm: the least of `SCALES` below which 98 % of them are."""
+def find_colour_scale_top(errors: np.ndarray) -> float:
+    """Return the first value in `SCALES` that is at least the 98th percentile of the errors, cm."""
     high = float(np.percentile(errors, 98))
     return float(next((top for top in SCALES if high <= top), SCALES[-1]))
 
 
 @dataclass(frozen=True)
 class ClipPiece:
-    """A piece of a clip: the truth, and predictions by their labels.
+    """A piece of a clip with the true motion and predictions.
 
     Attributes:
         title: the clip's name.
         truth: joint positions (N, 22, 3), metres, world (Z up), at 60 Hz.
-        predictions: the same for each label.
-        start: the index in the clip of the piece's first frame.
+        predictions: predicted joint positions by label, in the layout of `truth`.
+        start: the index of the piece's first frame in the clip.
     """
 
     title: str
@@ -97,57 +97,57 @@ class ClipPiece:
     @cached_property
     def top(self) -> float:
         """The top of the colour scale, cm, shared by all predictions."""
-        return colour_scale_top(np.stack(list(self.errors.values())))
+        return find_colour_scale_top(np.stack(list(self.errors.values())))
 
     @cached_property
     def floor(self) -> float:
-        """The floor's height, metres: where the truth's lowest joints are."""
+        """The floor's height, metres, estimated from the lowest true joints."""
         return float(np.percentile(self.truth[..., 2].min(1), 5)) - min(RADII)
 
     @cached_property
     def metres(self) -> float:
-        """The height that a picture covers, metres: larger with hands above the head."""
+        """The height of the visible area, metres; raised hands make it larger."""
         joints = np.stack([self.truth, *self.predictions.values()])
         distance = np.linalg.norm(joints[..., :2] - self.truth[:, None, ROOT, :2], axis=-1)
         up = joints[..., 2] - self.floor + np.tan(ELEVATION) * distance  # distant joints are drawn higher
         highest = np.nan_to_num(up, nan=0.0, posinf=0.0).max() + TIP
         return float(np.clip(highest - BOTTOM, LOWEST, HIGHEST))
 
-    def rows(self, frame: int) -> list[tuple[np.ndarray, np.ndarray | None]]:
-        """Return joints (22, 3) and their errors (22,) as fractions of the scale's top, for each row.
+    def list_skeletons(self, frame: int) -> list[tuple[np.ndarray, np.ndarray | None]]:
+        """Return joints (22, 3) and errors (22,), as fractions of the scale's top, of each skeleton.
 
-        The truth is first; its errors are None.
+        The truth comes first, with None as errors.
         """
         predicted = [(p[frame], self.errors[k][frame] / self.top) for k, p in self.predictions.items()]
         return [(self.truth[frame], None), *predicted]
 
-    def camera(self, azimuth: float, place: np.ndarray) -> Camera:
-        """Return a camera that looks at a person standing at a point (2,) on the floor, metres."""
+    def make_camera(self, azimuth: float, place: np.ndarray) -> Camera:
+        """Return a camera that looks at a point (2,) on the floor, metres, and at the person above it."""
         return Camera(np.array([*place, self.floor + BOTTOM + self.metres / 2]), azimuth, self.metres)
 
-    def azimuth(self, frame: int) -> float:
-        """Return the azimuth, radians, that shows the true person from the front, slightly from the side."""
+    def find_azimuth(self, frame: int) -> float:
+        """Return the camera azimuth, radians: a front view of the true person, turned slightly sideways."""
         left = self.truth[frame, 1] - self.truth[frame, 2]  # from right to left hip
         return float(np.arctan2(left[1], left[0])) + SIDE
 
-    def path(self) -> np.ndarray:
-        """Return the camera's position over time (N, 2), metres: the truth's root, smoothed."""
+    def smooth_camera_path(self) -> np.ndarray:
+        """Return the camera's position in each frame (N, 2), metres: the smoothed true root."""
         from scipy.ndimage import gaussian_filter1d  # slow to import
 
         return gaussian_filter1d(self.truth[:, ROOT, :2], SMOOTHING * FPS, axis=0, mode="nearest")
 
-    def seconds(self, frame: int) -> float:
+    def find_seconds(self, frame: int) -> float:
         """Return the time of a frame in the clip, seconds."""
         return (self.start + frame) / FPS
 
 
-def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUFFIXES) -> None:
-    """Raise InputError for an invalid picture file or a missing package, before any work is done.
+def check_picture_path(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUFFIXES) -> None:
+    """Raise InputError for an invalid picture file or a missing package.
 
     Args:
         path: the file to write.
-        key: the option or argument that gave the path.
-        suffixes: the possible suffixes.
+        key: the name of the option or argument in messages.
+        suffixes: the valid suffixes.
     """
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{key} {path}: must end in {', '.join(suffixes)}")
@@ -159,7 +159,7 @@ def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUF
 
 
 def write_picture(path: Path, piece: ClipPiece, poses: int = POSES, key: str = "path") -> None:
-    """Write a PNG of `poses` poses in a row, or a GIF or MP4 of all frames, completely or not at all.
+    """Write a PNG of `poses` poses, or a GIF or MP4 of all frames, completely or not at all.
 
     Raises:
         InputError: if the file can't be written, or PyAV is not installed for an MP4.
@@ -177,43 +177,42 @@ def write_picture(path: Path, piece: ClipPiece, poses: int = POSES, key: str = "
 def draw_poses(piece: ClipPiece, poses: int = POSES) -> Figure:
     """Draw a heat-map figure like the paper's Figs. 6 and 9 to 13.
 
-    The first row has the truth's poses, and each further row a prediction, coloured by error. Each pose is
-    seen from the person's front, by the same camera in all rows. The mean error of the 22 joints is written
-    under a prediction.
+    The first row shows true poses. Each other row shows a prediction, coloured by error, with the mean error
+    of the 22 joints below. All rows show a pose from the same camera, in front of the person.
     """
     labels = ["truth", *piece.predictions]
     figure, panels = make_panels(150 + 230 * poses, 60 + 360 * len(labels), len(labels), poses)
     frames = np.linspace(0, len(piece.truth) - 1, poses + 2).round().astype(int)[1:-1].tolist()
     for column, frame in zip(panels.T, frames, strict=True):
-        column[0].set_title(f"{piece.seconds(frame):.2f} s")
+        column[0].set_title(f"{piece.find_seconds(frame):.2f} s")
         _write_errors(column[1:], piece, frame)
     for panel, label in zip(panels[:, 0], labels, strict=True):
         panel.set_ylabel(label, weight="bold")
-    _add_scale(figure, piece)
+    _add_colour_scale(figure, piece)
     for column, frame in zip(panels.T, progress_bar(frames, "poses"), strict=True):
-        camera = piece.camera(piece.azimuth(frame), piece.truth[frame, 0, :2])
+        camera = piece.make_camera(piece.find_azimuth(frame), piece.truth[frame, 0, :2])
         _draw_skeletons(column, piece, frame, camera)
     return figure
 
 
 def draw_film(piece: ClipPiece) -> Iterator[np.ndarray]:
-    """Yield a film's pictures (H, W, 3), uint8, 30 a second, with a progress bar. H and W are even."""
+    """Yield a film's pictures (H, W, 3), uint8, 30 per second, and show a progress bar. H and W are even."""
     labels = ["truth", *piece.predictions]
     figure, panels = make_panels(120 + 340 * len(labels), 600, 1, len(labels))
     for panel, label in zip(panels[0], labels, strict=True):
         panel.set_title(label, weight="bold")
     _write_errors(panels[0, 1:], piece, 0)
-    title = _add_scale(figure, piece)
-    path, azimuth = piece.path(), piece.azimuth(len(piece.truth) // 2)
+    title = _add_colour_scale(figure, piece)
+    path, azimuth = piece.smooth_camera_path(), piece.find_azimuth(len(piece.truth) // 2)
     for frame in progress_bar(range(0, len(piece.truth), FPS // RATE), "pictures"):
-        _draw_skeletons(panels[0], piece, frame, piece.camera(azimuth, path[frame]))
+        _draw_skeletons(panels[0], piece, frame, piece.make_camera(azimuth, path[frame]))
         _write_errors(panels[0, 1:], piece, frame)
-        title.set_text(f"{piece.title}   {piece.seconds(frame):.2f} s")
+        title.set_text(f"{piece.title}   {piece.find_seconds(frame):.2f} s")
         yield get_pixels(figure)
 
 
 def _draw_skeletons(panels: Iterable[Axes], piece: ClipPiece, frame: int, camera: Camera) -> None:
-    for panel, (joints, errors) in zip(panels, piece.rows(frame), strict=True):
+    for panel, (joints, errors) in zip(panels, piece.list_skeletons(frame), strict=True):
         draw_skeleton(panel, camera, joints, errors, piece.floor)
 
 
@@ -222,27 +221,27 @@ def _write_errors(panels: Iterable[Axes], piece: ClipPiece, frame: int) -> None:
         panel.set_xlabel(f"{errors[frame].mean():.1f} cm")
 
 
-def _add_scale(figure: Figure, piece: ClipPiece) -> Text:
+def _add_colour_scale(figure: Figure, piece: ClipPiece) -> Text:
     """Add the colour scale and the title, fix the layout, and return the title."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    colours = ScalarMappable(Normalize(0, piece.top), heat_colours())
+    colours = ScalarMappable(Normalize(0, piece.top), make_heat_colours())
     figure.colorbar(colours, ax=figure.axes, shrink=0.6, aspect=24, label="error of a joint [cm]")
     title = figure.suptitle(piece.title, x=0.01, ha="left", weight="bold", size=16)
-    fix_layout(figure)
+    freeze_layout(figure)
     return title
 
 
 def encode_gif(pictures: Iterable[np.ndarray]) -> bytes:
     """Encode pictures as a GIF that repeats endlessly.
 
-    All pictures have one palette, so that the film does not flicker: the heat map and the truth in light and
-    shadow, and greys.
+    All pictures share one palette, so the film does not flicker. It has shades of the heat map, of the
+    truth's colour and of grey.
     """
     from PIL import Image
 
-    heat, white = heat_colours()(np.linspace(0, 1, 28))[:, :3], np.ones((1, 3))
+    heat, white = make_heat_colours()(np.linspace(0, 1, 28))[:, :3], np.ones((1, 3))
     hues = ((heat, 7, 1.1), (np.array([NEUTRAL]), 36, 1.1), (white, 24, 1.0))
     shades = [(np.linspace(0.3, top, n)[:, None, None] * hue).reshape(-1, 3) for hue, n, top in hues]
     palette = Image.new("P", (1, 1))

@@ -1,4 +1,4 @@
-"""A sheet of motion clips, each at a few moments."""
+"""A contact sheet: poses from several motion clips."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from memmlp.motion.clip import Skipped
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import clip_kinematics
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
-from memmlp.report.pictures.drawing import Camera, draw_skeleton, fix_layout, make_panels
+from memmlp.report.pictures.drawing import Camera, draw_skeleton, freeze_layout, make_panels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ACROSS, MOMENTS = 4, 3  # clips beside each other, moments of each
-NAME = 48  # the most characters of a name
-METRES, LENS = 2.2, 1.0  # height that a panel covers, and that the camera looks at, metres
+ACROSS, MOMENTS = 4, 3  # number of clips in a row, and of poses from each clip
+NAME = 48  # maximum number of characters of a name
+METRES, LENS = 2.2, 1.0  # height of a panel's visible area, and height of its centre, metres
 SIDE = np.deg2rad(35)  # the camera's angle from the person's front, radians
 
 
 def read_sample(
     source: Path, count: int, body: str = "builtin"
 ) -> tuple[list[tuple[str, np.ndarray]], list[Skipped], int]:
-    """Read a clip, or `count` of a folder's npz files, evenly spread in the order of their names.
+    """Read an npz file, or `count` files from a folder, evenly spaced in the order of their names.
 
     Returns:
-        Name and global joint positions (N, 22, 3), metres, world, of each clip; the files that contain no
-        clip; and the number of all files.
+        Name and global joint positions (N, 22, 3), metres, world, of each clip; the skipped files; and the
+        number of all files.
 
     Raises:
-        InputError: if there are no npz files, or none that was read contains a clip.
+        InputError: if the folder has no npz files, or no file could be read.
     """
     rest = load_rest_joints(body)
     files = find_clips(source).files if source.is_dir() else [source.name]
@@ -51,29 +51,29 @@ def read_sample(
             clips.append((clip.name, clip_kinematics(clip, rest)[1]))
     if not clips:
         first = f"{skipped[0].file}: {skipped[0].reason}"
-        raise InputError(f"{source}: no clip in {len(skipped)} files, the first: {first}")
+        raise InputError(f"{source}: none of {len(skipped)} files could be read, for example {first}")
     return clips, skipped, len(files)
 
 
 def draw_sheet(clips: Sequence[tuple[str, np.ndarray]]) -> Figure:
-    """Draw clips side by side, each at three evenly spread moments.
+    """Draw clips side by side, each with three evenly spaced poses.
 
     Args:
-        clips: name and global joint positions (N, 22, 3), metres, world (Z up, the floor at 0), of each.
+        clips: pairs of name and global joint positions (N, 22, 3), metres, world (Z up, floor at 0).
     """
     rows = -(-len(clips) // ACROSS)
     figure, panels = make_panels(150 * ACROSS * MOMENTS, 246 * rows, rows, ACROSS * MOMENTS)
     shown = list(zip(panels.reshape(-1, MOMENTS), clips, strict=False))
     for row, (name, _) in shown:
         row[1].set_title(name if len(name) <= NAME else f"…{name[1 - NAME :]}", size=9)
-    fix_layout(figure)
+    freeze_layout(figure)
     for row, (_, joints) in shown:
         for moment, panel in enumerate(row):
             frame = (2 * moment + 1) * len(joints) // (2 * MOMENTS)
-            draw_skeleton(panel, _camera(joints[frame]), joints[frame])
+            draw_skeleton(panel, _make_camera(joints[frame]), joints[frame])
     return figure
 
 
-def _camera(joints: np.ndarray) -> Camera:
+def _make_camera(joints: np.ndarray) -> Camera:
     left = joints[1] - joints[2]  # from right to left hip
     return Camera(np.array([*joints[0, :2], LENS]), np.arctan2(left[1], left[0]) + SIDE, METRES)

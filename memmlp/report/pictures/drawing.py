@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 DPI = 100
 NEUTRAL = (0.66, 0.70, 0.74)  # the truth's colour
-ELEVATION = np.deg2rad(12)  # by which a camera looks down, radians
-DISCS = 24  # discs along a limb
+ELEVATION = np.deg2rad(12)  # angle by which a camera looks down, radians
+DISCS = 24  # number of discs along a limb
 TONES = np.linspace(0, 1, 6)  # from a limb's dark edge to its highlight
-LIGHT = np.array([-0.28, 0.40])  # where the highlight is, right and up, in radii
-GRID, STEP = 0.5, 0.1  # metres between the floor's lines, and of their pieces
+LIGHT = np.array([-0.28, 0.40])  # offset of the highlight to the right and up, in radii
+GRID, STEP = 0.5, 0.1  # distance between the floor's lines, and length of their pieces, metres
 FLOOR = 0.56  # radius of the visible floor as a fraction of the picture's width
 SHADOW = 0.16  # radius of a limb's shadow, metres
 
 
-def heat_colours() -> Colormap:
-    """Return the colours of errors from 0 to 1, the top of the scale."""
+def make_heat_colours() -> Colormap:
+    """Return the colour map for errors, scaled to 0..1."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("heat", HEAT)
@@ -39,9 +39,9 @@ class Camera:
 
     Attributes:
         centre: the point (3,) in the middle of the picture, metres.
-        azimuth: radians about the vertical; at 0 the camera looks along +Y.
-        metres: the height that the picture covers.
-        elevation: radians by which the camera looks down.
+        azimuth: rotation about the vertical axis, radians; at 0 the camera looks along +Y.
+        metres: the height of the visible area.
+        elevation: the angle by which the camera looks down, radians.
     """
 
     centre: np.ndarray
@@ -61,7 +61,7 @@ class Camera:
 
 
 def make_panels(width: int, height: int, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
-    """Return a figure of so many pixels, and its panels (rows, columns) without frames and ticks."""
+    """Return a figure of a size in pixels, and its panels (rows, columns) without frames and ticks."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -71,14 +71,14 @@ def make_panels(width: int, height: int, rows: int, columns: int) -> tuple[Figur
     return figure, figure.subplots(rows, columns, squeeze=False, subplot_kw=plain)
 
 
-def fix_layout(figure: Figure) -> None:
-    """Find the panels' places once for all of a figure's drawings."""
+def freeze_layout(figure: Figure) -> None:
+    """Compute the panel positions once, so later drawings do not move them."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
 
 
 def get_pixels(figure: Figure) -> np.ndarray:
-    """Draw a figure, and return it as (height, width, 3), uint8."""
+    """Draw a figure, and return its pixels (height, width, 3), uint8."""
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
 
@@ -93,13 +93,13 @@ def encode_png(figure: Figure) -> bytes:
 def draw_skeleton(
     axes: Axes, camera: Camera, joints: np.ndarray, errors: np.ndarray | None = None, floor: float = 0.0
 ) -> None:
-    """Draw one skeleton in a panel, in place of an earlier one.
+    """Draw a skeleton in a panel, and remove the previous one.
 
     Args:
-        axes: the panel; its coordinates become metres to the right and up from the camera's centre.
+        axes: the panel; its coordinates become metres from the camera's centre, to the right and up.
         camera: the projection.
         joints: positions (22, 3), metres, world.
-        errors: the joints' errors (22,) as fractions of the colour scale's top; None for the truth.
+        errors: errors of the joints (22,), as fractions of the colour scale's top; None for the truth.
         floor: the floor's height, metres.
     """
     for artist in list(axes.collections):
@@ -112,7 +112,7 @@ def draw_skeleton(
 
 
 def _draw_limbs(axes: Axes, camera: Camera, joints: np.ndarray, errors: np.ndarray | None) -> None:
-    """Draw each limb as overlapping discs, from its dark edge to its highlight; distant limbs come first."""
+    """Draw each limb as overlapping discs, with dark edges and a highlight; distant limbs come first."""
     part = np.linspace(0, 1, DISCS)
     limits = np.array([[camera.project(point) for point in ends(limb, joints)] for limb in LIMBS])
     centres = limits[:, :1] + part[:, None] * (limits[:, 1:] - limits[:, :1])  # (limb, disc, 3)
@@ -121,7 +121,7 @@ def _draw_limbs(axes: Axes, camera: Camera, joints: np.ndarray, errors: np.ndarr
     colours = np.broadcast_to(NEUTRAL, (*radii.shape, 3))
     if errors is not None:
         begin, end = errors[[limb.first for limb in LIMBS]], errors[[limb.end for limb in LIMBS]]
-        colours = heat_colours()(begin[:, None] + part * (end - begin)[:, None])[..., :3]
+        colours = make_heat_colours()(begin[:, None] + part * (end - begin)[:, None])[..., :3]
     order = np.argsort(centres[..., 2].mean(1))
     size = 1 - 0.85 * TONES[:, None, None]
     bright = 0.6 + 0.5 * TONES[:, None, None]
@@ -135,13 +135,13 @@ def _draw_limbs(axes: Axes, camera: Camera, joints: np.ndarray, errors: np.ndarr
 
 
 def _draw_floor(axes: Axes, camera: Camera, joints: np.ndarray, floor: float, radius: float) -> None:
-    """Draw the floor's grid, which fades out around the person, and a soft shadow under each limb's ends."""
+    """Draw a floor grid that fades out with distance, and a soft shadow below both ends of each limb."""
     from matplotlib.collections import LineCollection
 
     x, y = camera.centre[:2]
     steps, lines = np.arange(-radius, radius, STEP), GRID * np.arange(-radius // GRID, radius // GRID + 1)
     grid = np.stack(np.meshgrid(steps, lines), -1).reshape(-1, 2)
-    nearest = np.round(camera.centre[:2] / GRID) * GRID  # where lines of the grid cross
+    nearest = np.round(camera.centre[:2] / GRID) * GRID  # a crossing of grid lines
     starts = np.concatenate([np.add(grid, [x, nearest[1]]), np.add(grid[:, ::-1], [nearest[0], y])])
     lengths = np.repeat([[STEP, 0], [0, STEP]], len(grid), axis=0)
     segments = np.stack([starts, starts + lengths], 1)
@@ -152,7 +152,9 @@ def _draw_floor(axes: Axes, camera: Camera, joints: np.ndarray, floor: float, ra
         LineCollection(list(places), colors=[(0, 0, 0, dark) for dark in fade], linewidths=0.8)
     )
     feet = np.concatenate([ends(limb, joints) for limb in LIMBS])
-    spread = SHADOW + 0.25 * np.maximum(np.nan_to_num(feet[:, 2:]) - floor, 0)  # higher up, wider and fainter
+    spread = SHADOW + 0.25 * np.maximum(
+        np.nan_to_num(feet[:, 2:]) - floor, 0
+    )  # higher joints: wider, fainter
     feet[:, 2] = floor
     sizes = 2 * spread * [1, np.sin(camera.elevation)]
     dark = [(0, 0, 0, 0.03 * (SHADOW / radius) ** 2) for (radius,) in spread]
@@ -160,11 +162,18 @@ def _draw_floor(axes: Axes, camera: Camera, joints: np.ndarray, floor: float, ra
 
 
 def _add_ellipses(axes: Axes, places: np.ndarray, sizes: np.ndarray, colours: Any) -> None:
-    """Add filled ellipses with these centres (n, 2), widths and heights (n, 2), metres, and colours."""
+    """Add filled ellipses.
+
+    Args:
+        axes: the panel.
+        places: the centres (n, 2), metres.
+        sizes: widths and heights (n, 2), metres.
+        colours: n colours.
+    """
     from matplotlib.collections import EllipseCollection
 
-    known = np.isfinite(places).all(1)  # a diverged network has joints without a place
-    widths, heights = sizes[known].T
-    shape: dict[str, Any] = {"units": "xy", "offsets": places[known], "offset_transform": axes.transData}
-    colours = np.asarray(colours)[known]
+    finite = np.isfinite(places).all(1)  # a diverged network predicts NaN
+    widths, heights = sizes[finite].T
+    shape: dict[str, Any] = {"units": "xy", "offsets": places[finite], "offset_transform": axes.transData}
+    colours = np.asarray(colours)[finite]
     axes.add_collection(EllipseCollection(widths, heights, 0, facecolors=colours, linewidths=0, **shape))

@@ -1,4 +1,4 @@
-"""A picture of a skeleton map: a file's stance with its mapped nodes beside the built-in body."""
+"""A picture that compares a file's skeleton, with its mapped nodes, to the built-in body."""
 
 from __future__ import annotations
 
@@ -11,31 +11,33 @@ from memmlp.common.files import atomic_write
 from memmlp.motion.importing.convert import StanceView
 from memmlp.motion.importing.skeleton_map import Z_UP, without_namespace
 from memmlp.motion.limb_shapes import RADII
-from memmlp.report.pictures.drawing import Camera, draw_skeleton, encode_png, fix_layout, make_panels
+from memmlp.report.pictures.drawing import Camera, draw_skeleton, encode_png, freeze_layout, make_panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-METRES = 1.95  # height that a view covers
+METRES = 1.95  # height of a view's visible area
 LEFT, RIGHT, MIDDLE, UNMAPPED = "#1f6fd0", "#d0561f", "#2a8c4a", "#b4bac1"
 
 
 def write_skeleton_picture(path: Path, stance: StanceView, title: str) -> None:
-    """Write a PNG of a stance from the front and from the right: the file's nodes, and the body.
+    """Write a PNG with front and right views of the file's nodes and of the body in the same stance.
 
-    All nodes are grey. Those mapped to a body joint are coloured and numbered; a list has their names.
+    Mapped nodes are coloured and numbered, and a list shows their names. Other nodes are grey.
     """
     figure, panels = make_panels(1700, 440, 1, 5)
     figure.suptitle(f"{title}, read from {stance.source}", x=0.01, ha="left", weight="bold")
     labels = ("", "the file, from the front", "from the right", "the body in this stance", "from the right")
     for panel, label in zip(panels[0], labels, strict=True):
         panel.set_xlabel(label)
-    fix_layout(figure)
+    freeze_layout(figure)
     names, front, side, body_front, body_side = panels[0]
     nodes = without_namespace(stance.nodes)
-    for row, (joint, node) in enumerate(sorted(stance.mapped.items(), key=lambda one: colour_of(one[0]))):
+    for row, (joint, node) in enumerate(
+        sorted(stance.mapped.items(), key=lambda one: find_joint_colour(one[0]))
+    ):
         text = f"{node}  {joint} = {nodes[node]}"
-        names.text(0, 0.96 - row / 23, text, color=colour_of(joint), size=9)
+        names.text(0, 0.96 - row / 23, text, color=find_joint_colour(joint), size=9)
     _draw_nodes(front, stance, 0)
     _draw_nodes(side, stance, 2)
     joints = stance.body @ Z_UP.T
@@ -46,15 +48,15 @@ def write_skeleton_picture(path: Path, stance: StanceView, title: str) -> None:
     atomic_write(path, encode_png(figure))
 
 
-def colour_of(joint: str) -> str:
-    """Return the colour of a joint's side."""
+def find_joint_colour(joint: str) -> str:
+    """Return the colour of a body joint: one for the left side, one for the right, one for the middle."""
     return {"left": LEFT, "right": RIGHT}.get(joint.split("_")[0], MIDDLE)
 
 
 def _draw_nodes(panel: Axes, stance: StanceView, axis: int) -> None:
-    """Draw all nodes with lines to their parents, with the given axis to the right.
+    """Draw all nodes with lines to their parents. The given coordinate axis points right.
 
-    The panel covers the mapped nodes: a root at the origin may be far from the person.
+    The panel shows the area around the mapped nodes, because a root node may be far from the person.
     """
     mapped = stance.positions[list(stance.mapped.values())]
     places = (stance.positions - (mapped.min(0) + mapped.max(0)) / 2)[:, [axis, 1]]
@@ -62,7 +64,7 @@ def _draw_nodes(panel: Axes, stance: StanceView, axis: int) -> None:
         if parent >= 0:
             panel.plot(*places[[parent, node]].T, color=UNMAPPED, lw=2, marker=".")
     for joint, node in stance.mapped.items():
-        panel.plot(*places[node], color=colour_of(joint), marker="o")
+        panel.plot(*places[node], color=find_joint_colour(joint), marker="o")
         panel.annotate(
             str(node), places[node], (4, 4), textcoords="offset points", size=8, annotation_clip=True
         )

@@ -1,1 +1,1 @@
-"""Tables of a sweep's variants, with measured values beside those that the paper prints."""
+"""Tables of a sweep's variants, with measured values and the values printed in the paper."""

@@ -1,7 +1,7 @@
-"""Makes the table of a sweep from its runs, and the summary that the sweep leaves in its folder.
+"""Makes a sweep's table from finished runs; nothing is trained.
 
-A table never trains. It knows from the plan which identity the run of each variant and seed has, and reads
-the folder outputs/runs/<id>/, whichever command made it.
+The plan has the run id for each variant and seed. The results are in outputs/runs/<id>/, whichever command
+made the run.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from memmlp.report.tables.effects import (
     use_existing_branches,
 )
 from memmlp.report.tables.flags import DescribeRun, describe_nothing, find_flags, flag_early_tables
-from memmlp.report.tables.measured_run import Measured, select_measured
+from memmlp.report.tables.measured_run import MeasuredRun, select_runs_for_metric
 from memmlp.report.tables.table import Cell, Effect, Key, Row, Table
 from memmlp.report.tables.table_text import FORMATS
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
@@ -30,15 +30,15 @@ from memmlp.sweep.plan import Plan
 if TYPE_CHECKING:
     from memmlp.report.tables.seed_rounds import Rounds
 
-Find = Callable[[Variant, int], Measured | None]
-Read = Callable[[Path, tuple[str, ...]], Measured]
+FindRun = Callable[[Variant, int], MeasuredRun | None]
+ReadRun = Callable[[Path, tuple[str, ...]], MeasuredRun]
 
 
-def make_run_finder(plan: Plan, read: Read) -> Find:
-    """Return a function that finds the results of the plan's finished run for a variant and a seed."""
+def make_run_finder(plan: Plan, read: ReadRun) -> FindRun:
+    """Return a function that reads a planned run, or returns None if the run is not finished."""
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
-    def find(variant: Variant, seed: int) -> Measured | None:
+    def find(variant: Variant, seed: int) -> MeasuredRun | None:
         entry = entries.get((variant.label, seed))
         complete = entry is not None and plan.complete(entry)
         return read(plan.run_of(entry).folder, entry.stages) if entry and complete else None
@@ -47,7 +47,7 @@ def make_run_finder(plan: Plan, read: Read) -> Find:
 
 
 def make_state_finder(plan: Plan) -> DescribeRun:
-    """Return a function that describes the state of an unfinished run of the plan, once it has started."""
+    """Return a function that describes the state of a planned run; None for new and finished runs."""
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
     def describe(variant: Variant, seed: int) -> str | None:
@@ -63,8 +63,8 @@ def make_state_finder(plan: Plan) -> DescribeRun:
     return describe
 
 
-def find_finished_runs(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
-    """Return the finished runs of each runnable variant, by seed."""
+def find_finished_runs(sweep: Sweep, find: FindRun) -> dict[str, RunsBySeed]:
+    """Return the finished runs by variant label and seed."""
     return {
         variant.label: {
             seed: run for seed in sweep.seeds_of(variant) if (run := find(variant, seed)) is not None
@@ -84,24 +84,24 @@ def make_table(
     """Make the table of a sweep.
 
     Args:
-        sweep: the sweep; if seeds were spent in rounds, `rounds.spent(sweep)`.
+        sweep: the sweep; with seed rounds, `rounds.restrict_sweep(sweep)`.
         runs: the finished runs of every runnable variant, by seed (`find_finished_runs`).
-        modes: the modes of evaluation to show ("stream", "window"); a mode that no run has is left out, if
-            runs have another one.
-        command: the command that makes missing runs; `memmlp sweep` with the sweep's name by default.
-        state: describes in a word the state of a variant's and seed's unfinished run, or returns None.
-        rounds: the rounds that decided the verdicts; None for verdicts from a fixed number of seeds.
+        modes: the evaluation modes to show ("stream", "window"). Modes without results are left out if
+            another mode has results.
+        command: the command that makes missing runs; by default, `memmlp sweep` and the sweep's name.
+        state: describes the state of an unfinished run, or returns None.
+        rounds: the seed rounds that decided the verdicts; None for a fixed number of seeds.
     """
     has_errors = bool(set(sweep.metrics) - set(COSTS))
     evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
     existing = tuple(mode for mode in modes if mode in evaluated) or tuple(modes)
     shown_modes = existing if has_errors else tuple(modes)[:1]
     shown = use_existing_branches(sweep, runs)
-    # The correction is over both modes, whichever of them are shown.
+    # The correction includes both modes, even if only one is shown.
     found = compute_effects(shown, runs, MODES if has_errors else shown_modes)
     comparisons = sum(effect.p is not None for effect in found.values())
     if rounds:
-        found, comparisons = rounds.apply_verdicts(found), len(rounds.comparisons(sweep))
+        found, comparisons = rounds.apply_verdicts(found), len(rounds.list_comparison_keys(sweep))
     flags = find_flags(shown, sweep, runs, command or f"memmlp sweep {sweep.name}", state)
     return Table(
         name=sweep.name,
@@ -113,20 +113,20 @@ def make_table(
         branch_source=sweep.branch_source,
         smallest=dict(sweep.smallest),
         comparisons=comparisons,
-        rows=tuple(_row(shown, one, runs.get(one.label), shown_modes, found) for one in shown.variants),
+        rows=tuple(_make_row(shown, one, runs.get(one.label), shown_modes, found) for one in shown.variants),
         notes=(*sweep.notes, *(f"{one.label}: {one.note}" for one in sweep.variants if one.note)),
         flags=(*flags, *(() if rounds else flag_early_tables(shown, runs))),
         analyses=tuple((one.seeds, one.level) for one in rounds.analyses) if rounds else (),
     )
 
 
-def _row(
+def _make_row(
     sweep: Sweep, variant: Variant, runs: RunsBySeed | None, modes: Sequence[str], found: Mapping[Key, Effect]
 ) -> Row:
 
     def cell(mode: str, metric: str) -> Cell:
-        counted = select_measured(metric, runs or {})
-        numbers = {seed: run.value(mode, variant.branch, metric) for seed, run in counted.items()}
+        counted = select_runs_for_metric(metric, runs or {})
+        numbers = {seed: run.get_value(mode, variant.branch, metric) for seed, run in counted.items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}
         effect = found.get(Key(variant.label, mode, metric))
         return Cell(
@@ -150,7 +150,7 @@ def _row(
 
 
 def make_empty_table(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
-    """Make the table of a sweep whose runs can't be identified: the paper's values, and the reason."""
+    """Make a table with only the paper's values, and flag the reason why runs can't be identified."""
     runs: dict[str, RunsBySeed] = {variant.label: {} for variant in sweep.runnable()}
     return replace(make_table(sweep, runs, modes), flags=(reason,))
 
@@ -160,25 +160,28 @@ def restrict_to_source(
 ) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
     """Restrict a sweep and its finished runs to one source's test clips.
 
-    If the control has no such clips, the first variant that has some becomes the control.
+    If the control has no such clips, the first variant with such clips becomes the control.
 
     Returns:
-        The sweep without the variants whose runs have no test clip from the source, with a title that names
-        the source; the runs of the remaining variants, by seed, evaluated on these clips alone; and a flag
-        that names the variants left out.
+        The sweep without the variants that have no test clip from the source; the runs of the remaining
+        variants, by seed, restricted to the source's clips; and a flag that lists the removed variants.
 
     Raises:
         InputError: if no run has a test clip from the source.
     """
-    parts = {label: {seed: run.by_source() for seed, run in seeds.items()} for label, seeds in runs.items()}
+    parts = {
+        label: {seed: run.split_by_source() for seed, run in seeds.items()} for label, seeds in runs.items()
+    }
     own: dict[str, RunsBySeed] = {
         label: {seed: found[source] for seed, found in seeds.items() if source in found}
         for label, seeds in parts.items()
     }
     if not any(own.values()):
-        known = sorted({name for seeds in parts.values() for found in seeds.values() for name in found})
-        expected = f"expected {', '.join(known)}" if known else "the data has a single source"
-        raise InputError(f"--source {source}: no finished run has a test clip of it; {expected}")
+        names = sorted(
+            {name for seeds in parts.values() for by_source in seeds.values() for name in by_source}
+        )
+        expected = f"must be {' or '.join(names)}" if names else "the data has a single source"
+        raise InputError(f"--source {source}: no finished run has test clips from this source; {expected}")
     without = {label for label, seeds in runs.items() if seeds and not own[label]}
     variants = [
         replace(one, against=None) if one.against in without else one
@@ -195,10 +198,10 @@ def restrict_to_source(
     return replace(sweep, variants=tuple(variants), control=control, title=title), left, flags
 
 
-def restrict_clips(
+def restrict_and_group_clips(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str | None, patterns: Sequence[str]
 ) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
-    """Restrict a sweep and its runs to a source, and group clips by patterns, if these are given."""
+    """Restrict a sweep and its runs to a source, if given, and group clips by patterns, if given."""
     flags: tuple[str, ...] = ()
     if source:
         sweep, runs, flags = restrict_to_source(sweep, runs, source)
@@ -209,30 +212,30 @@ def restrict_clips(
 def group_clips(
     runs: Mapping[str, RunsBySeed], patterns: Sequence[str]
 ) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
-    """Put test clips whose names match a pattern alike into one group, beside the groups of the data.
+    """Merge groups of test clips with equal matches of a pattern.
 
-    Statistics count groups, so this shows how much of a table depends on their choice.
+    Statistics count groups, so this shows how much a table depends on the grouping.
 
     Args:
         runs: the finished runs of a sweep's variants, by seed.
-        patterns: regular expressions, as those of `data.split.groups`.
+        patterns: regular expressions, as in `data.split.groups`.
 
     Returns:
-        The runs of the variants, by seed, and a flag that says which clips are together.
+        The variants' runs by seed, and a flag that describes the merged groups.
 
     Raises:
-        InputError: for a pattern that is not a regular expression, or puts nothing together.
+        InputError: if a pattern is not a regular expression, or merges no groups.
     """
 
     def regroup(patterns: Sequence[str]) -> dict[str, RunsBySeed]:
         return {
-            label: {seed: run.together(patterns) for seed, run in seeds.items()}
+            label: {seed: run.group_clips(patterns) for seed, run in seeds.items()}
             for label, seeds in runs.items()
         }
 
     def count_groups(runs: Mapping[str, RunsBySeed]) -> int:
         every = (run for seeds in runs.values() for run in seeds.values())
-        return len({run.group(clip) for run in every for clip in run.clips})
+        return len({run.get_group(clip) for run in every for clip in run.clips})
 
     before = count_groups(runs)
     for pattern in patterns:
@@ -241,7 +244,7 @@ def group_clips(
         except InputError as error:
             raise InputError(f"--together {pattern}: {str(error).partition(': ')[2]}") from None
         if count_groups(tied) == before:
-            raise InputError(f"--together {pattern}: puts no test clips together")
+            raise InputError(f"--together {pattern}: must match clips in different groups; nothing to merge")
     if not patterns:
         return dict(runs), ()
     own = regroup(patterns)

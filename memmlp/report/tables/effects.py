@@ -12,28 +12,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memmlp.report.tables.measured_run import SHARED, Measured, select_measured
+from memmlp.report.tables.measured_run import SHARED_METRIC, MeasuredRun, select_runs_for_metric
 from memmlp.report.tables.statistics import (
     compute_detectable,
     compute_equivalence_p,
     correct_by_holm,
     count_needed_seeds,
-    decide,
+    decide_verdict,
     estimate_paired_effects,
 )
-from memmlp.report.tables.table import STEADY, Effect, Key
+from memmlp.report.tables.table import MAX_TIME_RATIO, Effect, Key
 from memmlp.sweep.definition import COSTS, MODES, TIMES, Sweep, Variant
 
-RunsBySeed = Mapping[int, Measured]  # a variant's finished runs by seed
+RunsBySeed = Mapping[int, MeasuredRun]  # a variant's finished runs by seed
 
 
-class Paired(NamedTuple):
+class PairedDifferences(NamedTuple):
     """A variant's differences from its control.
 
     Attributes:
-        matrix: the variant's errors minus the control's (S, C), by seed and clip.
-        groups: the number of each clip's group (C,).
-        diverged: whether further clips were lost because a network diverged on them.
+        matrix: the variant's errors minus the control's errors (S, C), by seed and clip.
+        groups: the index of each clip's group (C,).
+        diverged: whether clips were removed because a network diverged on them.
     """
 
     matrix: np.ndarray
@@ -41,16 +41,16 @@ class Paired(NamedTuple):
     diverged: bool = False
 
     @property
-    def testable(self) -> bool:
-        """Whether there is a p-value: with several seeds and groups of clips, and no clip lost to divergence.
+    def is_testable(self) -> bool:
+        """Whether a p-value can be computed: it needs several seeds, several clip groups and no divergence.
 
-        What is left after a divergence is too easy a test of the network that diverged.
+        After a divergence, the remaining clips would favour the network that diverged.
         """
         return len(self.matrix) > 1 and len(set(self.groups)) > 1 and not self.diverged
 
 
 def find_control(sweep: Sweep, variant: Variant) -> Variant | None:
-    """Return a variant's control; None for the sweep's control and for rows with only the paper's values."""
+    """Return a variant's control; None for the sweep's control and for rows with only printed values."""
     label = sweep.control_of(variant) if variant.overrides is not None else None
     return next((other for other in sweep.variants if other.label == label), None)
 
@@ -64,7 +64,7 @@ def list_comparisons(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
 
 
 def find_paper_effect(sweep: Sweep, variant: Variant, metric: str) -> float | None:
-    """Return the paper's difference from the control, from printed values; None if one is not printed."""
+    """Return the paper's value for a variant minus its value for the control; None if one is missing."""
     other = find_control(sweep, variant)
     ours = (variant.paper or {}).get(metric)
     theirs = (other.paper or {}).get(metric) if other else None
@@ -73,100 +73,103 @@ def find_paper_effect(sweep: Sweep, variant: Variant, metric: str) -> float | No
 
 def pair_differences(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str], labels: Container[str] | None = None
-) -> dict[Key, Paired]:
-    """Return the differences in all error metrics for all variants, or for those with the given labels."""
+) -> dict[Key, PairedDifferences]:
+    """Return differences in all error metrics, for all variants or only for the given labels."""
     found = {}
     for variant, other in list_comparisons(sweep):
         ours, theirs = runs[variant.label], runs[other.label]
         seeds = [seed for seed in ours if seed in theirs]
         if (labels is not None and variant.label not in labels) or not seeds:
             continue
-        if show_same_errors(variant, other, ours, theirs):
+        if have_same_errors(variant, other, ours, theirs):
             continue
         sides = [[side[seed] for seed in seeds] for side in (ours, theirs)]
         every = [*sides[0], *sides[1]]
         clips = [name for name in every[0].clips if all(name in run.clips for run in every)]
-        names = np.array([every[0].group(clip) for clip in clips], dtype=str)
+        names = np.array([every[0].get_group(clip) for clip in clips], dtype=str)
         groups = np.unique(names, return_inverse=True)[1]
         for mode, metric in itertools.product(modes, sweep.metrics):
             evaluated = all(any(mode in errors for errors in run.clips.values()) for run in every)
             if metric not in COSTS and evaluated:
                 branches = (variant.branch, other.branch)
-                pair = _paired(sides, clips, groups, branches, mode, metric)
+                pair = _subtract_control(sides, clips, groups, branches, mode, metric)
                 found[Key(variant.label, mode, metric)] = pair
     return {key: pair for key, pair in found.items() if pair.matrix.size}
 
 
 def compute_effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
-    """Return the effects of all variants, with p-values corrected over all of them.
+    """Return the effects of all variants, with p-values corrected for all comparisons.
 
-    For costs there are only the differences, without p-values.
+    Effects on costs have no p-values.
     """
     printed = {
         Key(variant.label, mode, metric): find_paper_effect(sweep, variant, metric)
         for variant, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
     }
-    return _costs(sweep, runs, modes) | _judged(
+    return _compare_costs(sweep, runs, modes) | _add_verdicts(
         estimate_effects(pair_differences(sweep, runs, modes), sweep.smallest, sensitivity=True),
         sweep.smallest,
         printed,
     )
 
 
-def show_same_errors(variant: Variant, other: Variant, ours: RunsBySeed, theirs: RunsBySeed) -> bool:
-    """Return whether two variants show the same errors of the same run, so that there is nothing to compare.
+def have_same_errors(variant: Variant, other: Variant, ours: RunsBySeed, theirs: RunsBySeed) -> bool:
+    """Return whether two variants have the same errors from the same run, so a comparison is pointless.
 
-    One run may have several kinds of errors, such as those after two kinds of inverse kinematics.
+    A run may have several sets of errors, for example from two inverse kinematics solvers.
     """
     if variant.branch != other.branch:
         return False
     both = [(ours[seed], theirs[seed]) for seed in ours.keys() & theirs.keys()]
-    # As texts, in which NaN equals NaN.
+    # They are compared as texts, because NaN differs from NaN.
     same = [pair for pair in both if pair[0].id == pair[1].id]
-    shown = [[str(run.shown(variant.branch)) for run in pair] for pair in same]
+    shown = [[str(run.get_branch_means(variant.branch)) for run in pair] for pair in same]
     return any(one == two for one, two in shown)
 
 
-def _paired(
-    sides: Sequence[Sequence[Measured]],
+def _subtract_control(
+    sides: Sequence[Sequence[MeasuredRun]],
     clips: Sequence[str],
     groups: np.ndarray,
     branches: tuple[str, str],
     mode: str,
     metric: str,
-) -> Paired:
-    """Return ours minus theirs over the clips for which all runs have a number.
+) -> PairedDifferences:
+    """Return the variant's errors minus the control's, on the clips for which all runs have a number.
 
     Args:
-        sides: the runs of both variants, by seed.
-        clips: the clips that all runs have (C).
-        groups: their groups (C,).
-        branches: the branches of both variants.
+        sides: the runs of the variant and of the control, in the order of the seeds.
+        clips: the names of the clips that all runs have (C).
+        groups: the group index of each clip (C,).
+        branches: the branch of the variant and of the control.
+        mode: the evaluation mode.
+        metric: the metric.
     """
 
-    def errors(metric: str) -> np.ndarray:
-        """Return a metric of both sides (2, S, C)."""
-        found = [
-            [run.by_clip(clips, mode, branch, metric) for run in side]
+    def collect_errors(metric: str) -> np.ndarray:
+        """Return a metric of the variant and of the control (2, S, C)."""
+        errors = [
+            [run.get_clip_values(clips, mode, branch, metric) for run in side]
             for side, branch in zip(sides, branches, strict=True)
         ]
-        return np.array(found).reshape(2, len(sides[0]), len(clips))
+        return np.array(errors).reshape(2, len(sides[0]), len(clips))
 
-    values = errors(metric)
+    values = collect_errors(metric)
     known = np.isfinite(values).all((0, 1))
-    diverged = not known.all() and _diverged(values, errors(SHARED))
+    diverged = not known.all() and _has_diverged(values, collect_errors(SHARED_METRIC))
     own, others = values[:, :, known]
-    return Paired(own - others, groups[known], diverged)
+    return PairedDifferences(own - others, groups[known], diverged)
 
 
-def _diverged(values: np.ndarray, positions: np.ndarray) -> bool:
-    """Return whether a network diverged on a clip for which a metric has no number, rather than a short clip.
+def _has_diverged(values: np.ndarray, positions: np.ndarray) -> bool:
+    """Return whether a network diverged on a clip without a number for a metric.
 
-    A clip is too short if no run has a number for it, although all have a position error.
+    The other explanation is a clip that is too short for the metric. Then no run has a number for the clip,
+    but all runs have a position error.
 
     Args:
-        values: the metric (2, S, C) of both sides.
-        positions: their position errors (2, S, C); runs without any tell nothing.
+        values: the metric of variant and control (2, S, C).
+        positions: position errors of variant and control (2, S, C). Runs with only NaN are ignored.
     """
     known, placed = np.isfinite(values), np.isfinite(positions)
     measured = placed.any(2, keepdims=True)
@@ -175,19 +178,18 @@ def _diverged(values: np.ndarray, positions: np.ndarray) -> bool:
 
 
 def estimate_effects(
-    pairs: Mapping[Key, Paired], smallest: Mapping[str, float], sensitivity: bool
+    pairs: Mapping[Key, PairedDifferences], smallest: Mapping[str, float], sensitivity: bool
 ) -> dict[Key, Effect]:
-    """Return the effects with their own p-values, not corrected yet, in the order of the pairs.
+    """Return the effects with uncorrected p-values, in the order of the pairs.
 
     Args:
         pairs: the differences.
-        smallest: the smallest effect of interest of each metric.
-        sensitivity: whether the effects that such tables would find are wanted, which take as long as the
-            rest.
+        smallest: the smallest effect of interest by metric.
+        sensitivity: whether to compute detectable effects, which doubles the time.
     """
     found: dict[Key, Effect] = {}
-    comparisons = max(1, count_testable(pairs))  # with none, nothing computed by it is shown
-    # Those of equal seeds and groups are computed at once.
+    comparisons = max(1, count_testable(pairs))
+    # Comparisons with equal seeds and groups are computed in one batch.
     batches: dict[tuple[int, bytes], list[Key]] = defaultdict(list)
     for key, pair in pairs.items():
         batches[len(pair.matrix), pair.groups.tobytes()].append(key)
@@ -202,26 +204,26 @@ def estimate_effects(
         columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
         for key, mean, low, high, p, equal, least in columns:
             values = {"low": low, "high": high}
-            values |= {"p": p, "equal": equal, "detectable": least} if pairs[key].testable else {}
-            known: dict[str, Any] = {name: or_none(number) for name, number in values.items()}
+            values |= {"p": p, "equal": equal, "detectable": least} if pairs[key].is_testable else {}
+            known: dict[str, Any] = {name: convert_nan_to_none(number) for name, number in values.items()}
             found[key] = Effect(float(mean), **known, **size)
     return {key: found[key] for key in pairs}
 
 
-def count_testable(pairs: Mapping[Key, Paired]) -> int:
-    """Return how many comparisons have a p-value, so that Holm's correction is over them."""
-    return sum(pair.testable for pair in pairs.values())
+def count_testable(pairs: Mapping[Key, PairedDifferences]) -> int:
+    """Count the comparisons with a p-value, for Holm's correction."""
+    return sum(pair.is_testable for pair in pairs.values())
 
 
 class NeededSeeds(NamedTuple):
-    """How many seeds a comparison needs to find an effect of the paper's size with a power of 80 %.
+    """The number of seeds that detects an effect of the paper's size with a power of 80 %.
 
     Attributes:
         key: the comparison.
         paper: the paper's difference.
         measured: the measured mean difference.
         seeds: the number of seeds so far.
-        needed: the number of seeds needed; None if no number is enough with these clips.
+        needed: the number of seeds needed; None if more seeds do not help.
     """
 
     key: Key
@@ -234,43 +236,44 @@ class NeededSeeds(NamedTuple):
 def compute_needed_seeds(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]
 ) -> list[NeededSeeds]:
-    """Return the seeds needed by all testable comparisons whose effect the paper prints.
+    """Return the seeds needed for all testable comparisons with an effect in the paper.
 
-    The correction is over the testable comparisons of both modes, as in the table.
+    As in the table, the correction includes both modes.
     """
     shown = use_existing_branches(sweep, runs)
     pairs, variants = pair_differences(shown, runs, MODES), {one.label: one for one in shown.variants}
     found = []
     for key, pair in pairs.items():
         effect = find_paper_effect(shown, variants[key.label], key.metric)
-        if effect and key.mode in modes and pair.testable:
+        if effect and key.mode in modes and pair.is_testable:
             needed = count_needed_seeds(pair.matrix, effect, count_testable(pairs), pair.groups)
             found.append(NeededSeeds(key, effect, float(pair.matrix.mean()), len(pair.matrix), needed))
     return found
 
 
-def _judged(
+def _add_verdicts(
     tested: Mapping[Key, Effect], smallest: Mapping[str, float], printed: Mapping[Key, float | None]
 ) -> dict[Key, Effect]:
     """Return the effects with verdicts and corrected p-values.
 
-    P-values of differences are corrected by Holm over all comparisons; those of equivalences are, too, as a
-    separate family.
+    Holm's correction treats differences and equivalences as two separate families of p-values.
     """
     keys = list(tested)
-    different = correct_by_holm(np.array([or_nan(tested[key].p) for key in keys]))
-    equal = correct_by_holm(np.array([or_nan(tested[key].equal) for key in keys]))
+    different = correct_by_holm(np.array([convert_none_to_nan(tested[key].p) for key in keys]))
+    equal = correct_by_holm(np.array([convert_none_to_nan(tested[key].equal) for key in keys]))
     judged = {}
     for key, p, q in zip(keys, different, equal, strict=True):
-        said = decide(float(p), float(q), tested[key].mean, printed.get(key))
-        judged[key] = replace(tested[key], holm=or_none(p), equal=or_none(q), verdict=said)
+        verdict = decide_verdict(float(p), float(q), tested[key].mean, printed.get(key))
+        judged[key] = replace(
+            tested[key], holm=convert_nan_to_none(p), equal=convert_nan_to_none(q), verdict=verdict
+        )
     return judged
 
 
-def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
-    """Return the differences of mean costs, without intervals: costs are exact, or hold for this machine.
+def _compare_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
+    """Return differences of mean costs, without intervals.
 
-    A time's effect says whether it differs beyond the noise of times.
+    For times, `within_noise` is set if the difference may be noise.
     """
 
     found = {}
@@ -278,37 +281,37 @@ def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -
         for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):
             sides = [compute_mean_cost(runs[one.label], metric) for one in (variant, other)]
             if not any(math.isnan(side) for side in sides):
-                noise = metric in TIMES and max(sides) < STEADY * min(sides)
+                noise = metric in TIMES and max(sides) < MAX_TIME_RATIO * min(sides)
                 found[Key(variant.label, mode, metric)] = Effect(sides[0] - sides[1], within_noise=noise)
     return found
 
 
 def compute_mean_cost(runs: RunsBySeed, metric: str) -> float:
-    """Return a cost's mean over the runs that count for it; NaN if none has it."""
-    costs = [run.costs[metric] for run in select_measured(metric, runs).values() if metric in run.costs]
+    """Return a cost's mean over the runs that `select_runs_for_metric` selects; NaN without a value."""
+    costs = [
+        run.costs[metric] for run in select_runs_for_metric(metric, runs).values() if metric in run.costs
+    ]
     return statistics.mean(costs) if costs else math.nan  # the mean of equal costs is exactly their value
 
 
-def or_none(number: float) -> float | None:
-    """Return the number; None for NaN."""
+def convert_nan_to_none(number: float) -> float | None:
     return None if math.isnan(number) else float(number)
 
 
-def or_nan(number: float | None) -> float:
-    """Return the number; NaN for None."""
+def convert_none_to_nan(number: float | None) -> float:
     return math.nan if number is None else number
 
 
 def use_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Sweep:
-    """Return the sweep with the rotation branch for variants whose networks have no other.
+    """Switch variants to the rotation branch if their networks have no other branch.
 
-    A network without a position branch may still have been evaluated after inverse kinematics.
+    Exception: the branch "combined" remains if such a network was evaluated after inverse kinematics.
     """
 
-    def single(variant: Variant) -> bool:
+    def has_one_branch(variant: Variant) -> bool:
         found = runs.get(variant.label, {}).values()
-        solved = variant.branch == "combined" and all(run.has("combined") for run in found)
-        return bool(found) and not solved and all(run.one_branch for run in found)
+        solved = variant.branch == "combined" and all(run.has_branch("combined") for run in found)
+        return bool(found) and not solved and all(run.has_one_branch for run in found)
 
-    variants = (replace(one, branch="rotation") if single(one) else one for one in sweep.variants)
+    variants = (replace(one, branch="rotation") if has_one_branch(one) else one for one in sweep.variants)
     return replace(sweep, variants=tuple(variants))

@@ -1,4 +1,4 @@
-"""Flags: what a reader has to know about the runs behind a table, one line each."""
+"""Flags: warnings about the runs behind a table, in one line each."""
 
 from __future__ import annotations
 
@@ -11,22 +11,28 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from memmlp.common.processes import MIN_CORE_SHARE
-from memmlp.report.tables.effects import RunsBySeed, list_comparisons, show_same_errors
-from memmlp.report.tables.measured_run import SHARED, UNKNOWN, Measured, find_core_share, select_undisturbed
-from memmlp.report.tables.table import STEADY
+from memmlp.report.tables.effects import RunsBySeed, have_same_errors, list_comparisons
+from memmlp.report.tables.measured_run import (
+    SHARED_METRIC,
+    UNKNOWN,
+    MeasuredRun,
+    find_core_share,
+    select_undisturbed_runs,
+)
+from memmlp.report.tables.table import MAX_TIME_RATIO
 from memmlp.runs.environment import compute_code_digests, list_differing_files
 from memmlp.runs.lookup import warn_if_hardly_trained
 from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
 
 DescribeRun = Callable[[Variant, int], str | None]
-Labelled = Sequence[tuple[str, Measured]]
-"""The finished runs of a table, each with its variant's label."""
+LabelledRuns = Sequence[tuple[str, MeasuredRun]]
+"""Pairs of variant label and finished run."""
 
-BUILT_IN = "builtin"
-ALIKE = 1.1  # how many times the frames of its control a variant may see in training before a flag says so
-UNTIED = 0.75  # share of test clips that are groups of their own from which on a flag asks for groups
-SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
-FILES = 5  # names of files that a flag has at most
+BUILT_IN_BODY = "builtin"
+MAX_TRAINING_RATIO = 1.1  # maximum ratio of training frames between variant and control without a flag
+UNGROUPED_FRACTION = 0.75  # fraction of ungrouped test clips from which a flag asks for groups
+SMPLH_TABLES = (1, 2, 3)  # the paper's tables on AMASS, which use SMPL-H bodies
+MAX_FILES = 5  # maximum number of file names in a flag
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
     "threads": "threads", "processes": "processes", "torch": "torch", "precision": "precision",
@@ -34,12 +40,12 @@ ORIGIN = {
 
 
 def describe_nothing(variant: Variant, seed: int) -> None:
-    """Return None, as there is nothing to say about a run: the default for a `DescribeRun`."""
+    """Return None: the default for a `DescribeRun`."""
 
 
 def find_flags(
     sweep: Sweep,
-    asked: Sweep,
+    requested: Sweep,
     runs: Mapping[str, RunsBySeed],
     command: str,
     state: DescribeRun,
@@ -47,30 +53,30 @@ def find_flags(
     """Yield the flags of a table.
 
     Args:
-        sweep: the sweep as it is shown.
-        asked: the sweep before variants without the wanted branch fell back to another branch.
+        sweep: the shown sweep.
+        requested: the sweep with the branches in its file; `sweep` has existing branches instead.
         runs: the finished runs of every runnable variant, by seed.
         command: the command that makes missing runs.
-        state: describes in a word the state of a variant's and seed's unfinished run.
+        state: describes the state of an unfinished run.
     """
     every = [(variant.label, run) for variant in sweep.runnable() for run in runs[variant.label].values()]
     has_errors = bool(set(sweep.metrics) - set(COSTS))
-    yield from _other_data(sweep)
-    yield from _missing_runs(sweep, runs, command, state)
+    yield from _flag_other_data(sweep)
+    yield from _flag_missing_runs(sweep, runs, command, state)
     if has_errors:
-        yield from _branches(sweep, asked, runs, command)
+        yield from _flag_branches(sweep, requested, runs, command)
     if offline := [label for label, run in every if run.origin.offline]:
         yield f"offline: uses future frames: {join_quoted(offline)}"
-    yield from _same_runs(sweep, runs)
-    yield from _unequal_clips(sweep, runs)
-    yield from _unequal_groups(every)
-    yield from _unmeasured_seeds(sweep, runs)
-    yield from _diverged_runs(sweep, runs)
+    yield from _flag_same_runs(sweep, runs)
+    yield from _flag_unequal_clips(sweep, runs)
+    yield from _flag_unequal_groups(every)
+    yield from _flag_unmeasured_seeds(sweep, runs)
+    yield from _flag_diverged_runs(sweep, runs)
     if "Jitter" in sweep.metrics:
-        yield from _smoother_than_truth(sweep, runs)
+        yield from _flag_smoother_than_truth(sweep, runs)
     if has_errors:
-        yield from _data_warnings(every, "resampled")
-        yield from _data_warnings(every, "unusual")
+        yield from _flag_data_warnings(every, "resampled")
+        yield from _flag_data_warnings(every, "unusual")
     for attribute, what in ORIGIN.items():
         unknown = "none" if attribute == "gpu" else UNKNOWN
         values = [(getattr(run.origin, attribute).replace(UNKNOWN, unknown), label) for label, run in every]
@@ -79,24 +85,24 @@ def find_flags(
     if set(TIMES) & set(sweep.metrics):
         timed = [(run.origin.timed_on, label) for label, run in every if run.costs]
         yield from flag_differences("machine of the times", [one for one in timed if one[0] != UNKNOWN])
-        yield from _busy_machine(sweep, runs)
+        yield from _flag_busy_machine(sweep, runs)
     if has_errors:
-        yield from _hardly_trained(every)
-    yield from _unequal_training(sweep, runs)
-    yield from _data_warnings(every, "partial", ", and no more")
-    yield from _data_warnings(every, "divided")
-    yield from _unequal_versions(every)
+        yield from _flag_short_training(every)
+    yield from _flag_unequal_training(sweep, runs)
+    yield from _flag_data_warnings(every, "partial", ", and no more")
+    yield from _flag_data_warnings(every, "divided")
+    yield from _flag_unequal_versions(every)
     if uncommitted := [label for label, run in every if run.origin.changed]:
         yield f"made by code with uncommitted changes: {join_quoted(uncommitted)}"
     if has_errors:
-        yield from _replicates(sweep, runs)
-        yield from _other_bodies_and_files(sweep, every)
+        yield from _flag_missing_replicates(sweep, runs)
+        yield from _flag_bodies_and_precision(sweep, every)
 
 
 def flag_early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
-    """Flag variants whose planned seeds are only partly finished.
+    """Flag variants with only part of their planned seeds.
 
-    Testing them now and again later inflates the false-positive rate.
+    A test now and another test later inflate the false-positive rate.
     """
     several = [one for one in sweep.runnable() if len(runs[one.label]) > 1]
     if early := [one.label for one in several if find_missing_seeds(sweep, one, runs)]:
@@ -107,16 +113,16 @@ def flag_early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[
 
 
 def find_missing_seeds(sweep: Sweep, variant: Variant, runs: Mapping[str, RunsBySeed]) -> list[int]:
-    """Return the seeds of a variant for which there is no run."""
+    """Return a variant's planned seeds without a finished run."""
     return [seed for seed in sweep.seeds_of(variant) if seed not in runs[variant.label]]
 
 
 def flag_older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> Iterator[str]:
-    """Flag runs that were made before code changed, though no component version was raised.
+    """Flag runs whose code has changed since, under the same component versions.
 
     Args:
-        runs: for each run its variant's label, the digests of its code (`compute_code_digests`; empty where
-            these are not known), and the users' packages that it uses.
+        runs: for each run, the variant's label, code digests (`compute_code_digests`; empty if unknown) and
+            the names of custom packages.
     """
     current = functools.cache(compute_code_digests)
     found = [
@@ -128,53 +134,55 @@ def flag_older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]
     if names:
         labels = join_quoted(label for label, files in found if files)
         since = "has changed since these runs, under the same component versions"
-        yield f"code of {join_some(names, FILES)} {since}: {labels}"
+        yield f"code of {join_first(names, MAX_FILES)} {since}: {labels}"
 
 
-def flag_differences(what: str, found: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Flag a property in which variants differ, and name the variants that have each value.
+def flag_differences(name: str, labelled_values: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Flag a property if it differs between variants, and list the variants with each value.
 
-    `found` has pairs of a value and a variant's label.
+    Args:
+        name: the property's name.
+        labelled_values: pairs of a value and a variant label.
     """
     groups: dict[str, list[str]] = defaultdict(list)
-    for value, label in found:
+    for value, label in labelled_values:
         groups[value].append(label)
     if len(groups) > 1:
         parts = [f"{value} of {join_quoted(labels)}" for value, labels in groups.items()]
-        yield f"{what} differs: {'; '.join(parts)}"
+        yield f"{name} differs: {'; '.join(parts)}"
 
 
 def drop_repeats(texts: Iterable[str]) -> list[str]:
-    """Return texts without repetitions, in their order."""
+    """Return the texts in order, without repetitions."""
     return list(dict.fromkeys(texts))
 
 
 def join_quoted(labels: Iterable[str]) -> str:
-    """Return labels in quotes, each once, joined with commas (`join_some`)."""
-    return join_some([f"'{label}'" for label in drop_repeats(labels)])
+    """Quote labels, and join them with commas, without repetitions (`join_first`)."""
+    return join_first([f"'{label}'" for label in drop_repeats(labels)])
 
 
-def join_some(texts: Sequence[str], most: int = 12) -> str:
-    """Join texts with commas; of many texts, only the first ones and the number of the others."""
+def join_first(texts: Sequence[str], most: int = 12) -> str:
+    """Join at most `most` texts with commas, followed by the number of omitted texts."""
     return ", ".join(texts[:most]) + (f", and {len(texts) - most} more" if len(texts) > most else "")
 
 
 def describe_core_share(label: str, share: float) -> str:
-    """Name a run that was timed while its thread had a core for only a share of the time."""
+    """Describe a run whose thread had a core for only a fraction (`share`) of the timed period."""
     return f"'{label}' (had a core for {100 * share:.0f} % of the time)"
 
 
-def _other_data(sweep: Sweep) -> Iterator[str]:
-    """Flag a table of the paper that names its data (a protocol on AMASS) but is shown for other data."""
+def _flag_other_data(sweep: Sweep) -> Iterator[str]:
+    """Flag a table of the paper that is shown for other data than the data in its sweep file."""
     own, chosen = (
         next((text for text in reversed(texts) if text.startswith("data=")), None)
         for texts in (sweep.base, sweep.command_line)
     )
     if sweep.table and own and chosen and own != chosen:
-        yield f"a table of {own}, shown with {chosen}: its errors do not compare with the paper's"
+        yield f"a table of {own}, shown with {chosen}: errors are not comparable with the paper"
 
 
-def _missing_runs(
+def _flag_missing_runs(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: DescribeRun
 ) -> Iterator[str]:
     lacking: dict[str, str] = {}
@@ -185,41 +193,43 @@ def _missing_runs(
             lacking[variant.label] = f"seed {', '.join(map(str, seeds))}{described}"
     alike = 1 < len(sweep.runnable()) == len(lacking) and len(set(lacking.values())) == 1
     if lacking:
-        gaps = join_some([f"'{label}' {gap}" for label, gap in lacking.items()])
+        gaps = join_first([f"'{label}' {gap}" for label, gap in lacking.items()])
         gaps = f"every variant's {next(iter(lacking.values()))}" if alike else gaps
         yield f"missing: {gaps}; fill with: {command}"
 
 
-def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], command: str) -> Iterator[str]:
-    wanted = {variant.label: variant.branch for variant in asked.variants}
+def _flag_branches(
+    sweep: Sweep, requested: Sweep, runs: Mapping[str, RunsBySeed], command: str
+) -> Iterator[str]:
+    wanted = {variant.label: variant.branch for variant in requested.variants}
     other = [one for one in sweep.runnable() if one.branch != wanted[one.label]]
     if other:
         labels, branches = (
             join_quoted(one.label for one in other),
-            join_some(drop_repeats(one.branch for one in other)),
+            join_first(drop_repeats(one.branch for one in other)),
         )
         yield f"the network has no other branch, so the row shows {branches}: {labels}"
     every = [(one, run) for one in sweep.runnable() for run in runs[one.label].values()]
-    if lacking := [one for one, run in every if not run.has(one.branch)]:
+    if lacking := [one for one, run in every if not run.has_branch(one.branch)]:
         branches, labels = (
-            join_some(drop_repeats(a.branch for a in lacking)),
+            join_first(drop_repeats(a.branch for a in lacking)),
             join_quoted(a.label for a in lacking),
         )
-        yield f"not evaluated in the branch {branches}: {labels}; do so with: {command}"
+        yield f"not evaluated in the branch {branches}: {labels}; evaluate with: {command}"
 
 
-def _same_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
-    """Flag variants that are the same run, because nothing distinguishes them under these overrides."""
+def _flag_same_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag pairs of variants that are the same run under these overrides."""
     for variant, other in list_comparisons(sweep):
         ours, theirs = runs[variant.label], runs[other.label]
-        if show_same_errors(variant, other, ours, theirs):
+        if have_same_errors(variant, other, ours, theirs):
             reason = "the difference between them has no effect here"
             if any(ours[seed].costs != theirs[seed].costs for seed in ours.keys() & theirs.keys()):
-                reason = "they differ in how it is deployed, and in nothing but costs"
+                reason = "they differ only in deployment and costs"
             yield f"'{variant.label}' and '{other.label}' are one run: {reason}"
 
 
-def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+def _flag_unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     for variant, other in list_comparisons(sweep):
         sides = [run.clips.keys() for one in (variant, other) for run in runs[one.label].values()]
         every: set[str] = set().union(*sides)
@@ -231,36 +241,37 @@ def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str
             )
 
 
-def _unequal_groups(every: Labelled) -> Iterator[str]:
+def _flag_unequal_groups(every: LabelledRuns) -> Iterator[str]:
     groups: dict[str, set[str]] = defaultdict(set)
     for _, run in every:
         for clip in run.clips:
-            groups[clip].add(run.group(clip))
+            groups[clip].add(run.get_group(clip))
     if several := [clip for clip, names in groups.items() if len(names) > 1]:
         yield f"runs differ in the groups of test clips (data.split.groups): {join_quoted(several)}"
 
 
-def _unmeasured_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
-    """Flag runs that were not measured by a metric in which other seeds of their variant were."""
+def _flag_unmeasured_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag runs without a metric that other seeds of the same variant have."""
     lacking: dict[tuple[str, int], list[str]] = defaultdict(list)
     for variant in sweep.runnable():
         found = runs[variant.label]
         modes = sorted({mode for run in found.values() for mode in run.means}) or [""]
         for metric, mode in itertools.product(sweep.metrics, modes):
-            without = [s for s, run in found.items() if run.value(mode, variant.branch, metric) is None]
+            without = [s for s, run in found.items() if run.get_value(mode, variant.branch, metric) is None]
             for seed in without if len(without) < len(found) else ():
                 lacking[variant.label, seed].append(metric)
     if lacking:
         texts = [
-            f"'{label}' seed {seed} ({join_some(drop_repeats(m))})" for (label, seed), m in lacking.items()
+            f"'{label}' seed {seed} ({join_first(drop_repeats(m))})" for (label, seed), m in lacking.items()
         ]
-        yield f"not measured, so the mean is of the other seeds: {join_some(texts)}"
+        yield f"not measured, so the mean uses only the other seeds: {join_first(texts)}"
 
 
-def _diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
-    """Flag runs that have no number for clips for which others have one, because their network diverged.
+def _flag_diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag runs whose network diverged on clips.
 
-    A clip for which no run has a number is too short for the metric, unless it has no position error either.
+    Such a run has no number for a clip. If no run has a number, the clip is too short for the metric, unless
+    it has no position error either.
     """
     lost: dict[tuple[str, int], set[str]] = defaultdict(set)
     every = [
@@ -268,50 +279,54 @@ def _diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str
     ]
     modes = {mode for _, _, run in every for mode in run.means}
 
-    def without_numbers(mode: str, metric: str) -> dict[tuple[str, int], set[str]]:
-        """Return the clips for which a run has no finite number, of runs that have the metric."""
+    def find_clips_without_numbers(mode: str, metric: str) -> dict[tuple[str, int], set[str]]:
+        """Return the clips without a finite number, by variant label and seed, for runs with the metric."""
         found = {}
         for variant, seed, run in every:
-            if run.value(mode, variant.branch, metric) is not None:
-                known = np.isfinite(run.by_clip(list(run.clips), mode, variant.branch, metric))
+            if run.get_value(mode, variant.branch, metric) is not None:
+                known = np.isfinite(run.get_clip_values(list(run.clips), mode, variant.branch, metric))
                 found[variant.label, seed] = set(itertools.compress(run.clips, ~known))
         return found
 
     for mode, metric in itertools.product(modes, set(sweep.metrics) - set(COSTS)):
-        lacking = without_numbers(mode, metric)
+        lacking = find_clips_without_numbers(mode, metric)
         if any(lacking.values()):
             short = set.intersection(*lacking.values())
-            short = short.difference(*without_numbers(mode, SHARED).values())
+            short = short.difference(*find_clips_without_numbers(mode, SHARED_METRIC).values())
             for cell, clips in lacking.items():
                 lost[cell] |= clips - short
     found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
     if found:
-        cells = join_some(found)
+        cells = join_first(found)
         yield f"NaN errors on clips, left out of differences, so verdicts stay inconclusive: {cells}"
 
 
-def _smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
-    """Flag variants whose motion has less jitter than the true one, as when a network hardly follows at all.
+def _flag_smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag variants whose predicted motion has less jitter than the true motion.
 
-    Variants that were tested on other clips have another truth, and a line of their own.
+    Variants that were tested on different clips are flagged in separate lines.
     """
     smoother: dict[tuple[str, str], list[str]] = defaultdict(list)
     for variant in sweep.runnable():
         found = list(runs[variant.label].values())
         for mode in sorted({mode for run in found for mode in run.means}):
             values = (
-                [run.value(mode, variant.branch, metric) for run in found]
+                [run.get_value(mode, variant.branch, metric) for run in found]
                 for metric in ("Jitter", "GT Jitter")
             )
-            made, true = ([one for one in some if one is not None and math.isfinite(one)] for some in values)
-            if made and true and np.mean(made) < np.mean(true):
-                smoother[mode, f"{np.mean(true):.2f}"].append(f"'{variant.label}' {np.mean(made):.2f}")
-    for (mode, truth), texts in smoother.items():
-        less = f"Jitter below the truth's {truth} ({mode}): {join_some(texts)}"
+            predicted, truth = (
+                [number for number in column if number is not None and math.isfinite(number)]
+                for column in values
+            )
+            if predicted and truth and np.mean(predicted) < np.mean(truth):
+                text = f"'{variant.label}' {np.mean(predicted):.2f}"
+                smoother[mode, f"{np.mean(truth):.2f}"].append(text)
+    for (mode, jitter), texts in smoother.items():
+        less = f"Jitter below the truth's {jitter} ({mode}): {join_first(texts)}"
         yield f"{less}; motion that is smoother than the truth is not better"
 
 
-def _hardly_trained(every: Labelled) -> Iterator[str]:
+def _flag_short_training(every: LabelledRuns) -> Iterator[str]:
     found = [(label, warn_if_hardly_trained(run.training.get("frames", 0.0))) for label, run in every]
     for warning in drop_repeats(warning for _, warning in found if warning):
         labels = drop_repeats(label for label, one in found if one == warning)
@@ -319,13 +334,13 @@ def _hardly_trained(every: Labelled) -> Iterator[str]:
         yield f"{warning}: {'every variant' if every_variant else join_quoted(labels)}"
 
 
-def _unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+def _flag_unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     frames = {
         label: sorted(number for run in found.values() if (number := run.training.get("frames")))
         for label, found in runs.items()
     }
 
-    def millions(label: str) -> str:
+    def format_millions(label: str) -> str:
         return "-".join(
             drop_repeats(f"{number / 1e6:.3g}" for number in (frames[label][0], frames[label][-1]))
         )
@@ -333,42 +348,42 @@ def _unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[
     unequal = []
     for variant, other in list_comparisons(sweep):
         both = frames[variant.label] + frames[other.label]
-        if frames[variant.label] and frames[other.label] and max(both) > ALIKE * min(both):
-            ours, theirs = millions(variant.label), millions(other.label)
+        if frames[variant.label] and frames[other.label] and max(both) > MAX_TRAINING_RATIO * min(both):
+            ours, theirs = format_millions(variant.label), format_millions(other.label)
             unequal.append(f"'{variant.label}' {ours} M to '{other.label}' {theirs} M")
     if unequal:
-        yield f"number of frames seen in training differs: {join_some(unequal)}"
+        yield f"number of frames seen in training differs: {join_first(unequal)}"
 
 
-def _busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+def _flag_busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     found, fewer = [], []
     for variant in sweep.runnable():
-        label, counted = variant.label, select_undisturbed(runs[variant.label])
+        label, counted = variant.label, select_undisturbed_runs(runs[variant.label])
         shares = [share for run in counted.values() if (share := find_core_share(run)) is not None]
         ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
         if shares and min(shares) < MIN_CORE_SHARE:
             found.append(describe_core_share(label, min(shares)))
-        elif ratios and max(ratios) > STEADY * min(ratios):
+        elif ratios and max(ratios) > MAX_TIME_RATIO * min(ratios):
             found.append(f"'{label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
         if len(counted) < len(runs[label]):
             fewer.append(f"'{label}' ({len(counted)} of {len(runs[label])})")
     if found:
-        yield f"timed on a busy machine, so that other work is in the times: {join_some(found)}"
+        yield f"timed on a busy machine, so that other work is in the times: {join_first(found)}"
     if fewer:
-        yield f"times are of the seeds that were timed with a core to themselves: {join_some(fewer)}"
+        yield f"times are of the seeds that were timed with a core to themselves: {join_first(fewer)}"
 
 
-def _data_warnings(every: Labelled, field: str, ending: str = "") -> Iterator[str]:
+def _flag_data_warnings(every: LabelledRuns, field: str, ending: str = "") -> Iterator[str]:
     for warning in drop_repeats(text for _, run in every if (text := getattr(run.origin, field))):
         labels = join_quoted(label for label, run in every if getattr(run.origin, field) == warning)
         yield f"{warning}{ending}: {labels}"
 
 
-def _unequal_versions(every: Labelled) -> Iterator[str]:
+def _flag_unequal_versions(every: LabelledRuns) -> Iterator[str]:
     versions = [(run.origin.every_version, label) for label, run in every]
     for name in sorted({name for known, _ in versions for name in known}):
         having = [(str(known[name]), label) for known, label in versions if name in known]
-        yield from flag_differences(f"recipe of {name}", having)
+        yield from flag_differences(f"component version of {name}", having)
     weights: dict[str, list[tuple[str, str]]] = defaultdict(list)
     for label, run in every:
         for prerequisite, digests in run.origin.prerequisite_weights.items():
@@ -380,24 +395,24 @@ def _unequal_versions(every: Labelled) -> Iterator[str]:
         yield from flag_differences(f"code of {name}", having)
 
 
-def _other_bodies_and_files(sweep: Sweep, every: Labelled) -> Iterator[str]:
-    bare = [label for label, run in every if run.origin.body == BUILT_IN]
-    if sweep.table in SMPLH and bare:
+def _flag_bodies_and_precision(sweep: Sweep, every: LabelledRuns) -> Iterator[str]:
+    bare = [label for label, run in every if run.origin.body == BUILT_IN_BODY]
+    if sweep.table in SMPLH_TABLES and bare:
         yield f"on the built-in skeleton; the paper uses SMPL-H bodies (data.body=FILE): {join_quoted(bare)}"
     less_precise = [label for label, run in every if run.origin.deployed != "fp32"]
     if less_precise:
         labels = join_quoted(less_precise)
-        yield f"size and times are of a file of less precision, errors of float32: {labels}"
+        yield f"size and times are for a file with less precision, errors are for float32: {labels}"
 
 
-def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
-    """Flag that intervals don't cover seeds, groups of clips or VQ-VAEs, if there is only one of them."""
+def _flag_missing_replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag intervals that do not cover seeds, clip groups or VQ-VAEs, because there is only one."""
     measured = {label: list(found.values()) for label, found in runs.items() if found}
     if len(measured) < 2:
         return
     every = [run for found in measured.values() for run in found]
     one_seed = max(map(len, measured.values())) == 1
-    one_group = max(len({run.group(clip) for clip in run.clips}) for run in every) == 1
+    one_group = max(len({run.get_group(clip) for clip in run.clips}) for run in every) == 1
     if one_seed and one_group:
         yield "one seed a variant and one group of test clips: no interval and no star"
     elif one_seed:
@@ -412,11 +427,11 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
             interval = "no interval" if one_group else "an interval about other clips alone"
             yield f"one seed, so {interval} and no star: {join_quoted(few)}"
 
-    def ungrouped(run: Measured) -> int:
-        return list(Counter(map(run.group, run.clips)).values()).count(1)
+    def count_single_clips(run: MeasuredRun) -> int:
+        return list(Counter(map(run.get_group, run.clips)).values()).count(1)
 
-    if not one_group and all(ungrouped(run) >= UNTIED * len(run.clips) for run in every):
-        alone, clips = min((ungrouped(run), len(run.clips)) for run in every if run.clips)
+    if not one_group and all(count_single_clips(run) >= UNGROUPED_FRACTION * len(run.clips) for run in every):
+        alone, clips = min((count_single_clips(run), len(run.clips)) for run in every if run.clips)
         each = f"{alone} of {clips} test clips are groups of their own"
         each = "each test clip is a group of its own" if alone == clips else each
         yield f"{each} (data.split.groups): right if no two share a person"

@@ -1,4 +1,4 @@
-"""The results of a finished run, read from its folder for tables."""
+"""Reads the results of a finished run from its folder."""
 
 from __future__ import annotations
 
@@ -29,48 +29,48 @@ from memmlp.sweep.definition import TIMES
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
 UNKNOWN = "?"
-SHARED = "MPJPE"  # a metric that both branches have
+SHARED_METRIC = "MPJPE"  # a metric of both branches
 CORE_SHARES = {
     "core share": "core_share",
     "network core share": "alone_core_share",
     "pose core share": "pose_core_share",
 }
-"""The shares of the measured times, of a step, of the network alone and of a pose, in which the thread had a
-core: their names among a run's costs, and in a deployment's record. Earlier runs lack some."""
-SAME = 1e-4  # relative difference up to which two errors count as those of the same joints (float32)
+"""Core shares: the fraction of a timed period in which the thread had a core, for a step, the network and a
+pose. Keys are names of a run's costs, values are keys of a deployment's record. Old runs lack some."""
+SAME_ERROR_TOLERANCE = 1e-4  # maximum relative difference between equal errors (float32)
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What a run was made from, and on which machine. All runs of a table should have the same origin.
+    """The code, data and machine of a run. All runs of a table should have the same origin.
 
-    Code, uncommitted changes, packages and machines include those of its prerequisites and its evaluations.
+    Code, uncommitted changes, packages and machines cover prerequisites and evaluations too.
 
     Attributes:
-        code: the commit; the package's version outside a checkout.
+        code: the commit; outside a checkout, the package's version.
         changed: whether the checkout had uncommitted changes.
-        data: the digest of the prepared data.
-        hardware: the processor of training and evaluations.
+        data: a digest of the prepared data.
+        hardware: the processor.
         device: "cpu", "cuda" or "mps".
         gpu: the GPU's name.
-        threads: torch's threads on the processor.
-        processes: how many processes trained it together.
-        torch: torch's version.
-        precision: the precision of training.
-        body: whose rest joints the motion is on: "builtin" or the file of a body model.
+        threads: the number of torch threads on the processor.
+        processes: the number of training processes.
+        torch: the version of torch.
+        precision: the training precision.
+        body: the body with the rest joints: "builtin" or the file of a body model.
         component_versions: the version of each component.
-        prerequisite: the id of the prerequisite run, such as a VQ-VAE's; None if it is missing.
-        prerequisite_versions: the version of each component of the prerequisite runs, as far as known.
-        prerequisite_weights: a digest of the weights of each prerequisite run, by its id, if known; two if
-            the run was resumed upon others.
-        partial: which part of its protocol's list the data is, in words; None if it is complete.
-        plugins: version and code digest of each user's package that it uses.
-        offline: whether frames are made with later ones, so that it can't run as a stream.
-        deployed: the precision of the exported file that was measured for size and times.
-        timed_on: the processor on which size and times were measured, and ONNX Runtime's version there.
-        divided: a warning, in words, if subjects have clips in both training and test; None otherwise.
-        resampled: a warning, in words, if test clips were recorded at a lower rate; None otherwise.
-        unusual: a warning, in words, if test clips are odd; None otherwise.
+        prerequisite: the id of the prerequisite run, such as a VQ-VAE; None without one.
+        prerequisite_versions: the known component versions of the prerequisite runs.
+        prerequisite_weights: a digest of the weights by prerequisite run id, if known. If the run was resumed
+            with other weights, the text has two digests.
+        partial: a warning if part of the protocol's clip list is missing; None otherwise.
+        plugins: version and code digest of each custom package.
+        offline: whether the network uses future frames, so it can't run as a stream.
+        deployed: the precision of the exported file; size and times are measured with this file.
+        timed_on: the processor and the ONNX Runtime version of the time measurements.
+        divided: a warning if subjects have clips in both training and test; None otherwise.
+        resampled: a warning if test clips were recorded at a lower rate; None otherwise.
+        unusual: a warning if test clips are unusual; None otherwise.
     """
 
     code: str
@@ -99,30 +99,29 @@ class Origin:
 
     @property
     def every_version(self) -> Mapping[str, int]:
-        """The component version of each component, of the prerequisite runs too."""
+        """The version of each component, including components of prerequisite runs."""
         return {**self.prerequisite_versions, **self.component_versions}
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredRun:
     """The results of a finished run.
 
     Attributes:
         id: the run's id.
-        means: the metrics' means over the test clips.
-        clips: the metrics of each clip, by its name.
-        groups: the group (take, subject) of each clip; a clip that is not listed is a group of its own.
-        costs: GFLOP and GMAC of the network as it was trained, for one frame; ms of a step of the exported
-            graph, the ratio of its time to the yardstick's in the same minute, millions of parameters, MB of
-            the ONNX file, frames per second, and the shares of the measured times in which the thread had a
-            core (CORE_SHARES).
-        origin: what the run was made from.
+        means: mean metrics over the test clips.
+        clips: metrics by clip name.
+        groups: the group (take, subject) of each clip; an unlisted clip forms a separate group.
+        costs: GFLOP and GMAC of the trained network for one frame; for the exported file, ms per step, ratio
+            to the yardstick's time in the same minute, millions of parameters, MB, frames per second and
+            core shares (CORE_SHARES).
+        origin: the code, data and machine.
         clip_sources: the source of each clip, if the data has several sources.
-        run: the run's folder; None for results that were kept without it.
-        training: what its training took, as far as known: `seconds`; `frames`, the frames seen, each counted
-            as often as it was drawn in a window; and `flops` for kept results.
-        code: a digest of the code of each file with which it was trained (`code_digests`), or several where
-            its prerequisite runs were trained with other code; empty for kept results.
+        run: the run's folder; None for kept results.
+        training: known training costs: `seconds`; `frames`, the total number of frames in all training
+            windows; and `flops` for kept results.
+        code: code digests by file (`compute_code_digests`), joined with different digests of prerequisite
+            runs; empty for kept results.
     """
 
     id: str
@@ -136,15 +135,15 @@ class Measured:
     training: Mapping[str, float] = field(default_factory=dict)
     code: Mapping[str, str] = field(default_factory=dict)
 
-    def value(self, mode: str, branch: str, metric: str) -> float | None:
+    def get_value(self, mode: str, branch: str, metric: str) -> float | None:
         """Return a metric's mean over clips, or a cost; None if it was not measured."""
         if metric in self.costs:
             return self.costs[metric]
         found = self.means.get(mode, {}).get(branch, {}).get(metric)
-        return None if found is None else float(found)  # files hold NaN as a word
+        return None if found is None else float(found)  # files store NaN as text
 
-    def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
-        """Return a metric for each of these clips (C,); NaN for clips that the run did not measure."""
+    def get_clip_values(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
+        """Return a metric for the named clips (C,); NaN for clips without a value."""
         clips = self.clips
         try:
             found = [clips[name][mode][branch][metric] for name in names]
@@ -152,103 +151,109 @@ class Measured:
             found = [clips[name].get(mode, {}).get(branch, {}).get(metric) for name in names]
         return np.array(found, float)  # None becomes NaN
 
-    def group(self, clip: str) -> str:
-        """Return the group of a clip."""
+    def get_group(self, clip: str) -> str:
+        """Return a clip's group; an unlisted clip forms a separate group."""
         return self.groups.get(clip, clip)
 
-    def together(self, patterns: Sequence[str]) -> Measured:
-        """Return the same results with clips in one group, too, whose names match a pattern alike.
+    def group_clips(self, patterns: Sequence[str]) -> MeasuredRun:
+        """Return the results with merged groups: clips with equal matches of a pattern share a group.
 
         Args:
-            patterns: regular expressions, as those of `data.split.groups`.
+            patterns: regular expressions, as in `data.split.groups`.
         """
-        grouping = Grouping(tuple(patterns), {clip: self.group(clip) for clip in self.clips})
+        grouping = Grouping(tuple(patterns), {clip: self.get_group(clip) for clip in self.clips})
         groups = grouping.tie({clip: clip for clip in self.clips})
         return replace(self, groups={clip: group[0] for group in groups for clip in group})
 
-    def by_source(self) -> dict[str, Measured]:
-        """Return the results on each source's clips alone, by source; empty if there is only one source."""
+    def split_by_source(self) -> dict[str, MeasuredRun]:
+        """Return the results by source, each restricted to the source's clips; empty for a single source."""
         own: dict[str, list[str]] = {name: [] for name in sorted(set(self.clip_sources.values()))}
         for clip in self.clips if own else ():
             own[self.clip_sources[clip]].append(clip)
-        return {name: self.over(clips) for name, clips in own.items()}
+        return {name: self.restrict_to_clips(clips) for name, clips in own.items()}
 
-    def over(self, clips: Sequence[str]) -> Measured:
-        """Return the same results restricted to some clips, with the means over these."""
+    def restrict_to_clips(self, clips: Sequence[str]) -> MeasuredRun:
+        """Return the results on the given clips, with means over these clips."""
         means = {
             mode: {
-                branch: _means({metric: self.by_clip(clips, mode, branch, metric) for metric in metrics})
+                branch: _average_clips(
+                    {metric: self.get_clip_values(clips, mode, branch, metric) for metric in metrics}
+                )
                 for branch, metrics in branches.items()
             }
             for mode, branches in self.means.items()
         }
         return replace(self, clips={clip: self.clips[clip] for clip in clips}, means=means)
 
-    def has(self, branch: str) -> bool:
+    def has_branch(self, branch: str) -> bool:
         """Return whether the run was evaluated in the given branch."""
         return any(branch in branches for branches in self.means.values())
 
-    def shown(self, branch: str) -> dict[str, Any]:
+    def get_branch_means(self, branch: str) -> dict[str, Any]:
         """Return the means in the given branch, by mode."""
         return {mode: branches.get(branch) for mode, branches in self.means.items()}
 
     @property
-    def one_branch(self) -> bool:
-        """Whether the network predicts rotations alone.
+    def has_one_branch(self) -> bool:
+        """Whether the network predicts only rotations.
 
-        Its positions then follow from the rotations by forward kinematics, so both branches have the same
-        errors. Clips on which the network diverged tell nothing about that.
+        Then forward kinematics computes the positions, and both branches have equal errors. Clips on which
+        the network diverged are ignored.
         """
         names, branches = list(self.clips), ("rotation", "position")
         modes = [mode for mode, known in self.means.items() if all(branch in known for branch in branches)]
-        sides = ([self.by_clip(names, mode, branch, SHARED) for branch in branches] for mode in modes)
+        sides = (
+            [self.get_clip_values(names, mode, branch, SHARED_METRIC) for branch in branches]
+            for mode in modes
+        )
         known = ((one, other, np.isfinite(one + other)) for one, other in sides)
-        return all(math.isclose(one[has].sum(), other[has].sum(), rel_tol=SAME) for one, other, has in known)
+        return all(
+            math.isclose(one[has].sum(), other[has].sum(), rel_tol=SAME_ERROR_TOLERANCE)
+            for one, other, has in known
+        )
 
 
-def _means(values: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Return the means over clips (C,) of a branch's metrics, as the evaluation does (`modes.evaluate`).
+def _average_clips(values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return the mean of each metric over clips (C,), like the evaluation (`modes.evaluate`).
 
-    A clip that is too short for a metric is left out of its mean. A clip for which the network returned NaN
-    is not: all means are then NaN. Such a clip is recognised by the metric that has a number even for the
-    shortest clip.
+    A mean excludes clips that are too short for the metric. If the network diverged on a clip, all means are
+    NaN. SHARED_METRIC shows this, because it has a number even for the shortest clip.
     """
-    diverged = SHARED in values and bool(np.isnan(values[SHARED]).any())
+    diverged = SHARED_METRIC in values and bool(np.isnan(values[SHARED_METRIC]).any())
     known = {metric: each[~np.isnan(each)] for metric, each in values.items()}
     return {m: float(each.mean()) if len(each) and not diverged else math.nan for m, each in known.items()}
 
 
-def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
+def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> MeasuredRun:
     """Read a finished run.
 
     Args:
         folder: the run's folder.
-        stages: identities of the evaluations and the deployment to read. By default, or if none of these
-            exist, all evaluations that use the network as the run's own config does, and the deployment that
-            the run shows (`Run.find_shown_deployment`).
+        stages: ids of the evaluations and the deployment to read. By default, or if none of these exists,
+            the run's config selects evaluations and deployment.
 
     Raises:
-        InputError: if a file is damaged; the message names it.
+        InputError: if a file is damaged.
     """
     run = Run(folder)
-    manifest = _read(run.manifest_path)
+    manifest = _read_intact_json(run.manifest_path)
     means: dict[str, dict[str, Any]] = {}
     clips: dict[str, dict[str, Any]] = {}
     groups: dict[str, str] = {}
     sources: dict[str, str] = {}
     wanted = [path for name in stages or () if (path := run.evaluation(name)).is_file()]
     paths = wanted or run.evaluations_as_configured.paths
-    reports = keep_one_solver(list(map(_read, paths)))
+    reports = keep_one_solver(list(map(_read_intact_json, paths)))
     for report in reports:
-        _join(means.setdefault(report["mode"], {}), report["mean"])
+        _merge_report(means.setdefault(report["mode"], {}), report["mean"])
         for clip in report["clips"]:
-            _join(clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}), clip)
+            _merge_report(clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}), clip)
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
             sources |= {clip["name"]: clip["source"]} if clip.get("source") else {}
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     deployed = (deployments or [run.deployment_as_configured])[-1]
     latency = deployed.record
-    origin = _evaluated(_with_prerequisites(_origin(manifest), run), reports)
+    origin = _add_evaluations(_add_prerequisites(_read_origin(manifest), run), reports)
     origin = replace(origin, deployed=find_deployed_precision(latency))
     origin = replace(
         origin,
@@ -258,42 +263,41 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     seconds, frames = (manifest.get("seconds") or {}).get("train"), count_training_frames(run)
     training = {"seconds": float(seconds)} if seconds is not None else {}
     training |= {"frames": frames} if frames else {}
-    costs, code = _costs(latency), _code(manifest)
-    return Measured(run.id, means, clips, groups, costs, origin, run, sources, training, code)
+    costs, code = _read_costs(latency), _read_code_digests(manifest)
+    return MeasuredRun(run.id, means, clips, groups, costs, origin, run, sources, training, code)
 
 
 def measure_untrained(
     overrides: Sequence[str], record: Mapping[str, Any], environment: Mapping[str, Any]
-) -> Measured:
-    """Return the costs of a network that was not trained, whose id is a digest of its overrides.
+) -> MeasuredRun:
+    """Return the costs of an untrained network; its id is a digest of the overrides.
 
     Args:
-        overrides: what the network was made with.
-        record: the network's sizes and times, as a deployment records them.
-        environment: the code, the packages and the hardware, as a run's manifest has them.
+        overrides: the overrides that define the network.
+        record: sizes and times, in the format of a deployment's record.
+        environment: code, packages and hardware, in the format of a run's manifest.
     """
     digest = hashlib.sha256("\n".join(["untrained", *overrides]).encode()).hexdigest()[:16]
-    return Measured(digest, {}, {}, {}, _costs(record), _origin(environment))
+    return MeasuredRun(digest, {}, {}, {}, _read_costs(record), _read_origin(environment))
 
 
-def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:
-    """Merge a report into known ones: its facts, and the errors of its branches, which others may lack."""
-    for name, value in more.items():
-        known[name] = {**known.get(name, {}), **value} if isinstance(value, Mapping) else value
+def _merge_report(merged: dict[str, Any], report: Mapping[str, Any]) -> None:
+    """Merge a report into earlier reports in place. Reports may have different branches."""
+    for name, value in report.items():
+        merged[name] = {**merged.get(name, {}), **value} if isinstance(value, Mapping) else value
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_intact_json(path: Path) -> dict[str, Any]:
     content = read_json(path)
     if not content or ("digest" in content and not is_intact(path)):
-        raise InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
+        raise InputError(f"{path}: cannot be read; repeat the run with force=true, or remove its folder")
     return content
 
 
-def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
-    """Return the costs that were measured, in the units of the tables.
+def _read_costs(latency: Mapping[str, Any]) -> dict[str, float]:
+    """Return the measured costs in the units of the tables.
 
-    Size and times are those of the file in the precision that was asked for; the network alone is timed in
-    float32 only.
+    Size and times refer to the file in the configured precision. "network ms" is always float32.
     """
     measured = select_deployed_measurements(latency)
 
@@ -315,13 +319,13 @@ def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
     return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}
 
 
-def _origin(manifest: Mapping[str, Any]) -> Origin:
+def _read_origin(manifest: Mapping[str, Any]) -> Origin:
 
     def of(key: str) -> str:
         return str(manifest.get(key) or UNKNOWN)
 
     git = manifest.get("git") or {}
-    # A training that other code resumed names the commit that it began with, too.
+    # If a training was resumed with other code, its first commit is listed too.
     before = [git["before"][:7]] if git.get("before") else []
     copied: dict[str, Any] = {name: of(name) for name in ("device", "gpu", "threads", "precision", "body")}
     for name in ("prerequisite", "partial", "divided", "resampled", "unusual"):
@@ -342,18 +346,18 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
     )
 
 
-def _code(manifest: Mapping[str, Any]) -> dict[str, str]:
+def _read_code_digests(manifest: Mapping[str, Any]) -> dict[str, str]:
     own, *others = [one.get("sources") or {} for one in (manifest, *get_recorded_prerequisites(manifest))]
-    return {name: _words([own[name], *(one[name] for one in others if name in one)]) for name in own}
+    return {name: _join_unique([own[name], *(one[name] for one in others if name in one)]) for name in own}
 
 
-def _with_prerequisites(origin: Origin, run: Run) -> Origin:
+def _add_prerequisites(origin: Origin, run: Run) -> Origin:
     prerequisite = get_recorded_prerequisites(run.manifest)
     digests: dict[str, list[str]] = defaultdict(list)
     for one in prerequisite:
         digests[one["id"]] += [one["weights"][:8]] if one.get("weights") else []
-    weights = {name: _words(found) for name, found in digests.items() if found}
-    joined = _joined(origin, list(map(_origin, prerequisite)))
+    weights = {name: _join_unique(found) for name, found in digests.items() if found}
+    joined = _join_origins(origin, list(map(_read_origin, prerequisite)))
     return replace(
         joined,
         prerequisite_versions=collect_prerequisite_versions(run.manifest),
@@ -361,48 +365,48 @@ def _with_prerequisites(origin: Origin, run: Run) -> Origin:
     )
 
 
-def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
-    others = [_origin({**report.get("made_by", {}), **report}) for report in reports]
+def _add_evaluations(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
+    others = [_read_origin({**report.get("made_by", {}), **report}) for report in reports]
     versions = {name: number for one in (origin, *others) for name, number in one.component_versions.items()}
     offline = any(report.get("offline") for report in reports)
-    return replace(_joined(origin, others), component_versions=versions, offline=offline)
+    return replace(_join_origins(origin, others), component_versions=versions, offline=offline)
 
 
-def _joined(origin: Origin, others: Sequence[Origin]) -> Origin:
+def _join_origins(origin: Origin, others: Sequence[Origin]) -> Origin:
     found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
-        found[name] = _words([getattr(origin, name), *known])
+        found[name] = _join_unique([getattr(origin, name), *known])
     plugins = dict(origin.plugins)
     for other in others:
-        plugins = _both(plugins, other.plugins)
+        plugins = _merge_texts(plugins, other.plugins)
     return replace(origin, **found, plugins=plugins)
 
 
-def _words(parts: Iterable[str]) -> str:
-    """Join words with commas, each once; a part may be several joined words."""
+def _join_unique(parts: Iterable[str]) -> str:
+    """Join texts with commas, without repetitions. A text may itself be a comma-separated list."""
     return ", ".join(dict.fromkeys(word for part in parts for word in part.split(", ")))
 
 
-def _both(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:
+def _merge_texts(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:
     words = {name: dict.fromkeys([*([known[name]] if name in known else []), more[name]]) for name in more}
     return {**known, **{name: ", ".join(each) for name, each in words.items()}}
 
 
-def find_core_share(run: Measured) -> float | None:
-    """Return the least share of a run's measured times in which the thread had a core; None if unknown."""
+def find_core_share(run: MeasuredRun) -> float | None:
+    """Return the smallest core share (CORE_SHARES) of a run; None if unknown."""
     return min((run.costs[name] for name in CORE_SHARES if name in run.costs), default=None)
 
 
-def select_undisturbed(runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
-    """Return the runs whose thread had a core while it was timed; all of them if that is known of none.
+def select_undisturbed_runs(runs: Mapping[int, MeasuredRun]) -> Mapping[int, MeasuredRun]:
+    """Return the runs that were timed with a core for their thread; all runs if there are no such runs.
 
-    A time does not depend on the seed, so one undisturbed measurement says more than a mean with others.
+    A time does not depend on the seed, so undisturbed measurements are better than a mean over all runs.
     """
     alone = {seed: run for seed, run in runs.items() if (find_core_share(run) or 0) >= MIN_CORE_SHARE}
     return alone or runs
 
 
-def select_measured(metric: str, runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
-    """Return the runs whose values of a metric count: of a time the undisturbed ones, else every run."""
-    return select_undisturbed(runs) if metric in TIMES else runs
+def select_runs_for_metric(metric: str, runs: Mapping[int, MeasuredRun]) -> Mapping[int, MeasuredRun]:
+    """Return the runs that count for a metric: undisturbed runs for a time, all runs otherwise."""
+    return select_undisturbed_runs(runs) if metric in TIMES else runs

@@ -1,4 +1,4 @@
-"""Rows of Table 17 that were measured in a browser: the output of `memmlp web`'s bench, read and checked."""
+"""Rows of Table 17 from a browser: reads and checks the output of the bench page of `memmlp web`."""
 
 from __future__ import annotations
 
@@ -13,84 +13,91 @@ from memmlp.common.errors import InputError, describe_read_error, escape_line_br
 from memmlp.report.tables.table import Cell, Effect, Row, Table
 
 FORMAT = "memmlp web bench 1"
-NUMBER = 17  # the table's, in the paper
-LARGEST = 1_000_000  # bytes of a file
+TABLE_NUMBER = 17  # table number in the paper
+MAX_BYTES = 1_000_000  # maximum file size
 GRAPHS = {"naive": "as published", "streaming": "stream"}
-BASE = ("AvatarPoser", "naive", "fp32")
-"""The network to which ratios on the page refer: AvatarPoser as published."""
-ABOUT = {"device": str, "browser": str, "onnxruntime_web": str, "date": str, "clock_ms": float}
-ROW = {
+BASE_NETWORK = ("AvatarPoser", "naive", "fp32")
+"""The reference for differences and ratios: AvatarPoser as published."""
+FILE_FIELDS = {"device": str, "browser": str, "onnxruntime_web": str, "date": str, "clock_ms": float}
+ROW_FIELDS = {
     "network": str, "parameters": float, "graph": str, "precision": str, "backend": str, "threads": float,
     "steps": float, "median_ms": float,
 }  # fmt: skip
-MAYBE = ("ratio_to_yardstick", "whole_median_ms")
-"""Numbers of a row that may be null."""
+OPTIONAL_ROW_FIELDS = ("ratio_to_yardstick", "whole_median_ms")
+"""Numbers in a row that may be null."""
 
 
 @dataclass(frozen=True)
 class BrowserBench:
-    """A file of the bench: the device, the browser, and the rows, each as the page wrote them."""
+    """The checked content of a bench file.
+
+    Attributes:
+        about: the device, the browser and other facts (FILE_FIELDS).
+        rows: the measurements (ROW_FIELDS).
+    """
 
     about: Mapping[str, Any]
     rows: tuple[Mapping[str, Any], ...]
 
     @property
     def name(self) -> str:
-        """The device and the browser, in words."""
+        """The device and the browser as a text."""
         return f"{self.about['device']}, {self.about['browser']}"
 
 
-def read(path: Path) -> BrowserBench:
-    """Read a file of the bench.
+def read_bench(path: Path) -> BrowserBench:
+    """Read a bench file.
 
     Raises:
-        InputError: if the file can't be read, or is not a file of the bench.
+        InputError: if the file can't be read, or is not a bench file.
     """
     try:
-        content = json.loads(path.read_bytes()[:LARGEST])
+        content = json.loads(path.read_bytes()[:MAX_BYTES])
         if content["format"] != FORMAT:
             raise ValueError(f"its format is not '{FORMAT}'")
         rows = tuple(
-            {name: _check(row, name, kind) for name, kind in ROW.items()}
-            | {name: _check(row, name, float, optional=True) for name in MAYBE}
+            {name: _check_value(row, name, kind) for name, kind in ROW_FIELDS.items()}
+            | {name: _check_value(row, name, float, optional=True) for name in OPTIONAL_ROW_FIELDS}
             for row in content["rows"]
         )
         if not rows:
             raise ValueError("it has no rows")
-        return BrowserBench({name: _check(content, name, kind) for name, kind in ABOUT.items()}, rows)
+        return BrowserBench(
+            {name: _check_value(content, name, kind) for name, kind in FILE_FIELDS.items()}, rows
+        )
     except OSError as error:
         raise InputError(f"--add {path}: {describe_read_error(error)}") from None
     except (ValueError, KeyError, TypeError) as error:
-        expected = "expected a file that the bench of a site of memmlp web copies or saves"
+        expected = "must be a file from the bench page of memmlp web"
         raise InputError(f"--add {path}: {error}; {expected}") from None
 
 
-def _check(found: Mapping[str, Any], name: str, kind: type, optional: bool = False) -> Any:
-    """Return a text that is safe to print on a terminal, or a number above 0."""
-    value = found[name]
+def _check_value(fields: Mapping[str, Any], name: str, kind: type, optional: bool = False) -> Any:
+    """Return a text that is safe for a terminal, or a number above 0. Raises ValueError for other values."""
+    value = fields[name]
     if kind is str and isinstance(value, str) and 0 < len(value) <= 300:
         return escape_line_breaks(value)
     if kind is float and type(value) in (int, float) and math.isfinite(value) and value > 0:
         return value
     if optional and value is None:
         return None
-    raise ValueError(f"{name}: {str(value)[:60]}: must be a {'text' if kind is str else 'number above 0'}")
+    raise ValueError(f"{name}={str(value)[:60]}: must be a {'text' if kind is str else 'number above 0'}")
 
 
 def add_rows(table: Table, measured: BrowserBench) -> Table:
-    """Return Table 17 with a browser's rows below its own.
+    """Add a browser's rows to Table 17.
 
-    Their differences and ratios compare with AvatarPoser as published, in the same browser on the same
-    backend. The column `ratio` compares with the same fixed yardstick as in the other rows.
+    Differences refer to AvatarPoser as published, in the same browser on the same backend. The column `ratio`
+    refers to the same fixed yardstick as in other rows.
 
     Raises:
-        InputError: for a table other than Table 17.
+        InputError: if the table is not Table 17.
     """
-    if table.number != NUMBER:
-        raise InputError(f"--add: {table.name} is not Table {NUMBER}; expected memmlp table {NUMBER}")
-    own = [row for row in measured.rows if (row["network"], row["graph"], row["precision"]) == BASE]
+    if table.number != TABLE_NUMBER:
+        raise InputError(f"--add: must be used with memmlp table {TABLE_NUMBER}, not with {table.name}")
+    own = [row for row in measured.rows if (row["network"], row["graph"], row["precision"]) == BASE_NETWORK]
     bases = {row["backend"]: row for row in own}
-    rows = [_row(table, measured, row, bases.get(row["backend"])) for row in measured.rows]
+    rows = [_make_row(table, measured, row, bases.get(row["backend"])) for row in measured.rows]
     about = measured.about
     threads, steps = (
         " or ".join(map(str, sorted({int(row[key]) for row in measured.rows})))
@@ -105,9 +112,11 @@ def add_rows(table: Table, measured: BrowserBench) -> Table:
     return replace(table, rows=(*table.rows, *rows), flags=(*table.flags, flag))
 
 
-def _row(table: Table, measured: BrowserBench, row: Mapping[str, Any], base: Mapping[str, Any] | None) -> Row:
+def _make_row(
+    table: Table, measured: BrowserBench, row: Mapping[str, Any], base: Mapping[str, Any] | None
+) -> Row:
     other = base if base is not row else None
-    costs, others = _costs(row), _costs(other) if other else {}
+    costs, others = _list_costs(row), _list_costs(other) if other else {}
 
     def cell(metric: str) -> Cell:
         value, theirs = costs.get(metric), others.get(metric)
@@ -115,9 +124,9 @@ def _row(table: Table, measured: BrowserBench, row: Mapping[str, Any], base: Map
         return Cell({} if value is None else {0: value}, effect=effect)
 
     return Row(
-        label=_label(measured, row),
+        label=_make_label(measured, row),
         branch=table.rows[0].branch,
-        against=_label(measured, other) if other else None,
+        against=_make_label(measured, other) if other else None,
         note=None,
         found=(0,),
         wanted=(0,),
@@ -125,14 +134,14 @@ def _row(table: Table, measured: BrowserBench, row: Mapping[str, Any], base: Map
     )
 
 
-def _label(measured: BrowserBench, row: Mapping[str, Any]) -> str:
-    """Name a row, with its network's size, as a site's networks may differ in size from the table's own."""
+def _make_label(measured: BrowserBench, row: Mapping[str, Any]) -> str:
+    """Return a row's label. It contains the network's size, because sites may use different sizes."""
     graph, size = GRAPHS.get(row["graph"], row["graph"]), row["parameters"] / 1e6
     how = f"{graph}, {row['precision']}, {row['backend']}"
     return f"{row['network']} of {size:.3g} M parameters, {how}: {measured.name}"
 
 
-def _costs(row: Mapping[str, Any]) -> dict[str, float | None]:
+def _list_costs(row: Mapping[str, Any]) -> dict[str, float | None]:
     return {
         "ms": row["median_ms"],
         "pose ms": row["whole_median_ms"],

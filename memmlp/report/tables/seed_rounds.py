@@ -1,12 +1,12 @@
-"""Rounds of seeds for variants with inconclusive verdicts: interim analyses fixed in advance, and their
-findings.
+"""Seed rounds: variants with inconclusive verdicts get more seeds, in interim analyses fixed in advance.
 
-Every variant goes through the same interim analyses, each at a number of seeds that was fixed at the start. A
-variant whose comparisons are all decided gets no further ones. An analysis uses the first seeds of a variant
-and of its control, whatever other seeds exist, and what it decides is final. It spends its level over all
-comparisons of the sweep about which nothing has been claimed, including those of variants that are at another
-analysis. So the levels add up to 5 % for either family of claims, even if a variant is late because its runs
-failed (docs/statistics.md).
+The numbers of seeds at the interim analyses are the same for all variants. A variant leaves the rounds when
+all its comparisons are decided. An analysis uses only the first seeds of a variant and its control. Its
+decisions are final.
+
+An analysis spends its level on all undecided comparisons of the sweep. These include variants that are at
+another analysis because runs failed. So the levels add up to 5 % for each family of claims
+(docs/statistics.md).
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import digest
 from memmlp.report.tables.effects import (
     RunsBySeed,
+    convert_nan_to_none,
+    convert_none_to_nan,
     estimate_effects,
     find_paper_effect,
     list_comparisons,
-    or_nan,
-    or_none,
     pair_differences,
     use_existing_branches,
 )
 from memmlp.report.tables.statistics import (
     Verdict,
     correct_sequentially,
-    decide,
+    decide_verdict,
     divide_level,
     make_schedule,
 )
@@ -44,7 +44,7 @@ from memmlp.report.tables.table import Effect, Key
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
 from memmlp.sweep.plan import Plan
 
-MOST = 13  # the largest number of seeds of a variant by default
+MAX_SEEDS = 13  # default maximum number of seeds of a variant
 ROUNDS_FILE = "rounds.json"
 
 
@@ -53,13 +53,13 @@ class Finding:
     """The finding of an interim analysis on one comparison.
 
     Attributes:
-        label, mode, metric: which comparison it is.
-        verdict: the verdict, final unless it is inconclusive.
+        label, mode, metric: the key of the comparison.
+        verdict: the verdict; final unless inconclusive.
         mean: the mean difference.
-        p: its p-value; None with one group of clips, or where a network diverged on a clip: no number of
-            seeds can decide the comparison.
-        holm: the corrected p-value of the difference, to be compared with the analysis' level.
-        equal: the corrected p-value of equivalence, to be compared with the analysis' level.
+        p: the p-value. None with a single clip group, or if a network diverged on a clip; then more seeds
+            cannot decide the comparison.
+        holm: the corrected p-value of the difference, for comparison with the analysis' level.
+        equal: the corrected p-value of equivalence, for comparison with the analysis' level.
     """
 
     label: str
@@ -77,23 +77,20 @@ class Finding:
         return Key(self.label, self.mode, self.metric)
 
     @property
-    def undecided(self) -> bool:
-        """Whether more seeds can decide the comparison: it is inconclusive, and was tested.
-
-        A comparison without a p-value, such as that of a variant with too few runs, waits for other reasons.
-        """
+    def is_undecided(self) -> bool:
+        """Whether more seeds can decide the comparison: it is inconclusive and has a p-value."""
         return self.verdict is Verdict.INCONCLUSIVE and self.p is not None
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """An interim analysis that was done.
+    """A finished interim analysis.
 
     Attributes:
-        seeds: how many seeds of each variant were analysed.
+        seeds: the number of seeds of each analysed variant.
         level: the level that it spent.
-        runs: by the label of each analysed variant, a digest of the variant's runs and its control's.
-        findings: the findings on the comparisons that were inconclusive before.
+        runs: a digest of the runs of variant and control, by label of each analysed variant.
+        findings: the findings on comparisons that were inconclusive before.
     """
 
     seeds: int
@@ -104,14 +101,14 @@ class Analysis:
 
 @dataclass(frozen=True)
 class Rounds:
-    """The rounds of a sweep.
+    """The seed rounds of a sweep.
 
     Attributes:
-        subject: what the verdicts depend on (`describe_subject`).
-        seeds: all seeds that may be spent, in order.
+        subject: the facts that determine the verdicts (`describe_subject`).
+        seeds: all available seeds, in order.
         schedule: the number of seeds at each interim analysis.
-        levels: the level that each of them spends.
-        analyses: the interim analyses that were done.
+        levels: the level of each interim analysis.
+        analyses: the finished interim analyses.
     """
 
     subject: Mapping[str, Any]
@@ -120,60 +117,60 @@ class Rounds:
     levels: tuple[float, ...]
     analyses: tuple[Analysis, ...] = ()
 
-    def position(self, label: str) -> int:
-        """Return how many analyses a variant has been through."""
+    def count_analyses(self, label: str) -> int:
+        """Count the finished analyses of a variant."""
         return sum(label in one.runs for one in self.analyses)
 
-    def latest(self) -> dict[Key, tuple[Finding, Analysis]]:
-        """Return the last finding on each comparison, with its analysis; decided ones were decided there."""
+    def find_latest(self) -> dict[Key, tuple[Finding, Analysis]]:
+        """Return the last finding on each comparison, with its analysis."""
         return {finding.key: (finding, one) for one in self.analyses for finding in one.findings}
 
-    def upcoming(self, sweep: Sweep) -> dict[str, int]:
-        """Return, by label, the number (from 0) of the next analysis of each variant that has one.
+    def find_next_analyses(self, sweep: Sweep) -> dict[str, int]:
+        """Return the index of the next analysis, by label, for variants with a next analysis.
 
-        A variant has a next one while some are scheduled, and it has an inconclusive comparison or had no
-        analysis yet.
+        A variant has a next analysis until the end of the schedule, if it has an undecided comparison or no
+        finished analysis.
         """
-        going = {finding.label for finding, _ in self.latest().values() if finding.undecided}
-        found = {variant.label: self.position(variant.label) for variant, _ in _compared(sweep)}
+        going = {finding.label for finding, _ in self.find_latest().values() if finding.is_undecided}
+        found = {variant.label: self.count_analyses(variant.label) for variant, _ in _list_comparisons(sweep)}
         return {
             label: number
             for label, number in found.items()
             if number < len(self.schedule) and (number == 0 or label in going)
         }
 
-    def seed_counts(self, sweep: Sweep) -> dict[str, int]:
-        """Return how many seeds each variant is to be trained with.
+    def count_seeds(self, sweep: Sweep) -> dict[str, int]:
+        """Return the number of seeds to train, by label.
 
-        This is the number of its latest or next analysis, or of such an analysis of a variant that is
-        compared with it, whichever is larger.
+        A variant needs the seeds of its next analysis, or of its last analysis at the end. A control needs
+        the seeds of all variants that are compared with it.
         """
-        upcoming = self.upcoming(sweep)
+        upcoming = self.find_next_analyses(sweep)
         found = {variant.label: self.schedule[0] for variant in sweep.runnable()}
-        for variant, other in _compared(sweep):
-            number = upcoming.get(variant.label, self.position(variant.label) - 1)
+        for variant, other in _list_comparisons(sweep):
+            number = upcoming.get(variant.label, self.count_analyses(variant.label) - 1)
             for label in (variant.label, other.label):
                 found[label] = max(found[label], self.schedule[number])
         return found
 
-    def spent(self, sweep: Sweep) -> Sweep:
-        """Return the sweep with seeds for each variant: those spent so far and those of its next analysis."""
-        counts = self.seed_counts(sweep)
+    def restrict_sweep(self, sweep: Sweep) -> Sweep:
+        """Return the sweep with the seeds to train for each variant (`count_seeds`)."""
+        counts = self.count_seeds(sweep)
         variants = tuple(
             replace(one, seeds=self.seeds[: counts[one.label]]) if one.label in counts else one
             for one in sweep.variants
         )
         return replace(sweep, variants=variants, seeds=self.seeds[: max(counts.values())])
 
-    def comparisons(self, sweep: Sweep) -> list[Key]:
-        """Return all comparisons: those with findings, and all possible ones of variants not analysed yet."""
-        new = [variant for variant, _ in _compared(sweep) if not self.position(variant.label)]
-        keys = (key for variant in new for key in _possible_keys(sweep, variant))
-        return list(dict.fromkeys([*self.latest(), *keys]))
+    def list_comparison_keys(self, sweep: Sweep) -> list[Key]:
+        """Return the keys of all findings, and all possible keys of variants without a finished analysis."""
+        new = [variant for variant, _ in _list_comparisons(sweep) if not self.count_analyses(variant.label)]
+        keys = (key for variant in new for key in _list_possible_keys(sweep, variant))
+        return list(dict.fromkeys([*self.find_latest(), *keys]))
 
     def apply_verdicts(self, effects: Mapping[Key, Effect]) -> dict[Key, Effect]:
-        """Return the effects with the analyses' verdicts in place of those from a fixed number of seeds."""
-        latest, found = self.latest(), dict(effects)
+        """Return the effects with the verdicts of the interim analyses."""
+        latest, found = self.find_latest(), dict(effects)
         for key, effect in effects.items():
             if not effect.verdict:
                 continue
@@ -191,17 +188,17 @@ class Rounds:
             )
         return found
 
-    def difference(self, wanted: Rounds) -> str | None:
-        """Name in a word what differs from the other rounds of the sweep; None if nothing does."""
-        if self.seeds != wanted.seeds:
+    def find_difference(self, other: Rounds) -> str | None:
+        """Return the name of the first fact that differs from other rounds; None if all facts are equal."""
+        if self.seeds != other.seeds:
             return "seeds"
-        if (self.schedule, self.levels) != (wanted.schedule, wanted.levels):
+        if (self.schedule, self.levels) != (other.schedule, other.levels):
             return "interim analyses"
-        return next((key for key, value in wanted.subject.items() if self.subject.get(key) != value), None)
+        return next((key for key, value in other.subject.items() if self.subject.get(key) != value), None)
 
     @classmethod
-    def of_json(cls, content: Mapping[str, Any]) -> Rounds:
-        """Return the rounds that `asdict` made. Raises KeyError, TypeError or ValueError if wrong."""
+    def from_json(cls, content: Mapping[str, Any]) -> Rounds:
+        """Parse the output of `asdict`. Raises KeyError, TypeError or ValueError for invalid content."""
         analyses = []
         for one in content["analyses"]:
             findings = tuple(Finding(**{**f, "verdict": Verdict(f["verdict"])}) for f in one["findings"])
@@ -211,17 +208,17 @@ class Rounds:
 
     @classmethod
     def read(cls, path: Path) -> Rounds | None:
-        """Read the rounds in a file; None if there is no file. Raises InputError if it is damaged."""
+        """Read rounds from a file; None if there is no file. Raises InputError for a damaged file."""
         try:
-            return cls.of_json(json.loads(path.read_bytes()))
+            return cls.from_json(json.loads(path.read_bytes()))
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: not a record of rounds ({error}); remove it to restart them") from None
+            raise InputError(f"{path}: damaged ({error}); remove the file to restart the rounds") from None
 
 
 def describe_subject(sweep: Sweep) -> dict[str, Any]:
-    """Return what the verdicts depend on, in types for JSON; it must not change between two analyses."""
+    """Return the facts that determine the verdicts, as JSON. They must not change between two analyses."""
     return {
         "variants": {
             variant.label: {
@@ -236,42 +233,42 @@ def describe_subject(sweep: Sweep) -> dict[str, Any]:
     }
 
 
-def start_rounds(sweep: Sweep, most: int = MOST) -> Rounds:
-    """Return new rounds of a sweep with at most `most` seeds.
+def start_rounds(sweep: Sweep, max_seeds: int = MAX_SEEDS) -> Rounds:
+    """Return new rounds of a sweep.
 
-    The sweep's own seeds come first, then the whole numbers that follow the largest of them.
+    The sweep's seeds come first, then the integers after the largest seed.
     """
-    following = itertools.count(max(sweep.seeds) + 1)
-    seeds = tuple(itertools.islice(itertools.chain(sweep.seeds, following), most))
-    schedule = make_schedule(most)
+    more_seeds = itertools.count(max(sweep.seeds) + 1)
+    seeds = tuple(itertools.islice(itertools.chain(sweep.seeds, more_seeds), max_seeds))
+    schedule = make_schedule(max_seeds)
     return Rounds(describe_subject(sweep), seeds, schedule, divide_level(len(schedule)))
 
 
-def advance(
+def do_next_analysis(
     rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], digests: Mapping[str, str]
 ) -> Rounds:
-    """Return the rounds after the next analysis that can be done; the same rounds if none can be.
+    """Do the next analysis, and return the new rounds; return `rounds` unchanged if no variant is ready.
 
-    A variant can be analysed when it and its control have all seeds of its next analysis. If runs failed,
-    variants may be at different analyses; those at an earlier one come first.
+    A variant is ready when it and its control have all seeds of its next analysis. If runs failed, variants
+    may be at different analyses. Then the earliest analysis comes first.
 
     Args:
         rounds: the rounds so far.
         sweep: the sweep with which the rounds began.
         runs: the finished runs by label and seed.
-        digests: by label, a digest of the runs of a variant and its control up to its next analysis.
+        digests: by label, a digest of all runs of variant and control for the variant's next analysis.
     """
     ready: dict[int, list[str]] = {}
-    for label, number in rounds.upcoming(sweep).items():
-        wanted = set(rounds.seeds[: rounds.schedule[number]])
-        if all(wanted <= set(runs[one]) for one in _pair(sweep, label)):
+    for label, number in rounds.find_next_analyses(sweep).items():
+        seeds = set(rounds.seeds[: rounds.schedule[number]])
+        if all(seeds <= set(runs[one]) for one in _find_pair(sweep, label)):
             ready.setdefault(number, []).append(label)
     if not ready:
         return rounds
     number = min(ready)
-    named = {label: digests[label] for label in ready[number]}
-    analysis = Analysis(rounds.schedule[number], rounds.levels[number], named, ())
-    analysis = replace(analysis, findings=tuple(_findings(rounds, sweep, runs, analysis)))
+    analysed = {label: digests[label] for label in ready[number]}
+    analysis = Analysis(rounds.schedule[number], rounds.levels[number], analysed, ())
+    analysis = replace(analysis, findings=tuple(_find_findings(rounds, sweep, runs, analysis)))
     return replace(rounds, analyses=(*rounds.analyses, analysis))
 
 
@@ -281,9 +278,9 @@ class VariantProgress:
 
     Attributes:
         label: the variant's label.
-        decided, inconclusive: how many of its comparisons are decided and inconclusive.
-        seeds: the number of seeds spent on it, or needed for its next analysis.
-        next: the number of seeds of its next analysis; None after the last one.
+        decided, inconclusive: the numbers of decided and of inconclusive comparisons.
+        seeds: the number of seeds to train (`Rounds.count_seeds`).
+        next: the number of seeds at the next analysis; None after the last analysis.
     """
 
     label: str
@@ -295,64 +292,69 @@ class VariantProgress:
 
 def list_progress(rounds: Rounds, sweep: Sweep) -> list[VariantProgress]:
     """Return each variant's progress through the rounds."""
-    upcoming = rounds.upcoming(sweep)
+    upcoming = rounds.find_next_analyses(sweep)
     verdicts: dict[str, list[Verdict]] = {}
-    for finding, _ in rounds.latest().values():
+    for finding, _ in rounds.find_latest().values():
         verdicts.setdefault(finding.label, []).append(finding.verdict)
     found = []
-    for label, seeds in rounds.seed_counts(sweep).items():
+    for label, seeds in rounds.count_seeds(sweep).items():
         own = verdicts.get(label, [])
         still = own.count(Verdict.INCONCLUSIVE)
-        following = rounds.schedule[upcoming[label]] if label in upcoming else None
-        found.append(VariantProgress(label, len(own) - still, still, seeds, following))
+        next_seeds = rounds.schedule[upcoming[label]] if label in upcoming else None
+        found.append(VariantProgress(label, len(own) - still, still, seeds, next_seeds))
     return found
 
 
 def digest_runs(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
-    """Return a digest of the identities of a variant's and its control's runs with the first `seeds` seeds.
+    """Return a digest of the ids of runs and evaluations of a variant and its control.
 
-    The identities include the evaluations that the sweep shows.
+    Args:
+        rounds: the rounds.
+        sweep: the sweep.
+        plan: the sweep's plan.
+        label: the variant's label.
+        seeds: the number of seeds to include.
     """
     keys = {(entry.label, entry.seed): entry.key for entry in plan.entries}
-    cells = [keys.get((one, seed)) for one in _pair(sweep, label) for seed in rounds.seeds[:seeds]]
+    cells = [keys.get((one, seed)) for one in _find_pair(sweep, label) for seed in rounds.seeds[:seeds]]
     return digest(cells)[:16]
 
 
 def check_same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> None:
-    """Check that past analyses compared the same runs that the sweep's variants have now.
+    """Check that finished analyses used the current runs of the sweep.
 
     Raises:
-        InputError: if an analysis compared other runs, after a change of data, configs or versions.
+        InputError: if an analysis used other runs, because data, configs or versions have changed since.
     """
     for one in rounds.analyses:
         for label, known in one.runs.items():
             if known != digest_runs(rounds, sweep, plan, label, one.seeds):
                 raise InputError(
-                    f"{path}: its interim analyses were of other runs of '{label}': data, configs or "
-                    "versions changed since; remove it to restart them"
+                    f"{path}: data, configs or versions of '{label}' changed since its interim analyses; "
+                    "remove the file to restart the rounds"
                 )
 
 
-def _compared(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
+def _list_comparisons(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
     return list_comparisons(sweep) if set(sweep.metrics) - set(COSTS) else iter(())
 
 
-def _possible_keys(sweep: Sweep, variant: Variant) -> list[Key]:
+def _list_possible_keys(sweep: Sweep, variant: Variant) -> list[Key]:
     metrics = [metric for metric in sweep.metrics if metric not in COSTS]
     return [Key(variant.label, mode, metric) for mode, metric in itertools.product(MODES, metrics)]
 
 
-def _pair(sweep: Sweep, label: str) -> tuple[str, str]:
-    return next((one.label, other.label) for one, other in _compared(sweep) if one.label == label)
+def _find_pair(sweep: Sweep, label: str) -> tuple[str, str]:
+    return next((one.label, other.label) for one, other in _list_comparisons(sweep) if one.label == label)
 
 
-def _findings(
+def _find_findings(
     rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], analysis: Analysis
 ) -> list[Finding]:
     seeds = rounds.seeds[: analysis.seeds]
     cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}
     pairs = pair_differences(use_existing_branches(sweep, cut), cut, MODES, analysis.runs)
-    before = {key: finding.verdict for key, (finding, _) in rounds.latest().items()}
+    before = {key: finding.verdict for key, (finding, _) in rounds.find_latest().items()}
     fresh = {
         key: effect
         for key, effect in estimate_effects(pairs, sweep.smallest, sensitivity=False).items()
@@ -360,28 +362,32 @@ def _findings(
     }
     elsewhere = [
         before.get(key, Verdict.INCONCLUSIVE)
-        for key in rounds.comparisons(sweep)
+        for key in rounds.list_comparison_keys(sweep)
         if key not in fresh and (key in before or key.label not in analysis.runs)
     ]
-    different, equal = _corrected(list(fresh.values()), elsewhere, analysis.level)
+    different, equal = _correct_p_values(list(fresh.values()), elsewhere, analysis.level)
     variants = {variant.label: variant for variant in sweep.variants}
     found = []
     for (key, effect), p, q in zip(fresh.items(), different, equal, strict=True):
         paper = find_paper_effect(sweep, variants[key.label], key.metric)
-        claim = decide(float(p), float(q), effect.mean, paper, analysis.level)
-        found.append(Finding(*key, claim, effect.mean, effect.p, or_none(p), or_none(q)))
+        claim = decide_verdict(float(p), float(q), effect.mean, paper, analysis.level)
+        found.append(
+            Finding(*key, claim, effect.mean, effect.p, convert_nan_to_none(p), convert_nan_to_none(q))
+        )
     return found
 
 
-def _corrected(
+def _correct_p_values(
     fresh: Sequence[Effect], elsewhere: Sequence[Verdict], level: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Correct p-values of differences and of equivalences (K,), over fresh and all other comparisons.
+    """Return corrected p-values of differences (K,) and of equivalences (K,).
+
+    The correction includes all comparisons of the sweep.
 
     Args:
         fresh: the comparisons (K) that the analysis can decide.
-        elsewhere: the verdicts of the other comparisons: decided before, or inconclusive because their
-            variants are at another analysis.
+        elsewhere: the verdicts on all other comparisons: decided before, or inconclusive because a variant is
+            at another analysis.
         level: the level that the analysis spends.
     """
     claims = [*[Verdict.INCONCLUSIVE] * len(fresh), *elsewhere]
@@ -389,7 +395,9 @@ def _corrected(
     differ = np.array([claim not in (Verdict.EQUIVALENT, Verdict.INCONCLUSIVE) for claim in claims], bool)
     away = np.arange(len(same)) >= len(fresh)
     p, q = (
-        np.array([or_nan(getattr(effect, name)) for effect in fresh] + [math.nan] * len(elsewhere))
+        np.array(
+            [convert_none_to_nan(getattr(effect, name)) for effect in fresh] + [math.nan] * len(elsewhere)
+        )
         for name in ("p", "equal")
     )
     equal = correct_sequentially(q, same, away & ~same)

@@ -12,11 +12,11 @@ from memmlp.report.tables.statistics import Verdict
 from memmlp.sweep.definition import COSTS
 
 LEVEL = 0.05
-STEADY = 1.25  # how many times a measured time may be another of the same work
+MAX_TIME_RATIO = 1.25  # maximum ratio between two measured times of the same work
 
 
 class Key(NamedTuple):
-    """The key of a table's cell: its variant, mode of evaluation and metric."""
+    """The key of a table's cell: variant label, evaluation mode and metric."""
 
     label: str
     mode: str
@@ -25,22 +25,22 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class Effect:
-    """A variant's difference from its control, over the seeds and clips that both have.
+    """A variant's difference from its control, over shared seeds and clips.
 
-    Fields that a comparison does not have are None; costs have only the mean, and whether it is noise.
+    Undefined fields are None. Effects on costs have only `mean` and `within_noise`.
 
     Attributes:
         mean: the mean difference.
         low, high: its 95 % interval.
         p: its p-value, not corrected.
-        holm: its p-value, corrected over the table's comparisons.
+        holm: its p-value, corrected for all comparisons in the table.
         equal: the corrected p-value of equivalence (see `memmlp.report.tables.statistics`).
-        verdict: the verdict that follows from these.
-        detectable: the smallest difference that this comparison would have found with 80 % power.
-        seeds, clips, groups: how many of each were paired.
-        level: the level with which the corrected p-values are compared.
-        decided: the number of seeds of the interim analysis that decided the verdict; None without one.
-        within_noise: whether it is between times that differ by no more than STEADY times.
+        verdict: the verdict.
+        detectable: the smallest difference that this comparison detects with 80 % power.
+        seeds, clips, groups: the numbers of paired seeds, clips and clip groups.
+        level: the significance level for corrected p-values.
+        decided: the number of seeds at the interim analysis that decided the verdict; None without one.
+        within_noise: whether the ratio of two times is at most MAX_TIME_RATIO.
     """
 
     mean: float
@@ -59,14 +59,14 @@ class Effect:
     within_noise: bool = False
 
     @property
-    def significant(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the difference is significant after the correction."""
         return self.holm is not None and self.holm < self.level
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A metric of a variant: its values by seed, the paper's value, and both differences from the control."""
+    """A variant's metric: values by seed, the paper's value, and measured and printed effect."""
 
     values: Mapping[int, float]
     paper: float | None = None
@@ -88,9 +88,9 @@ class Cell:
 
     @property
     def agrees(self) -> bool | None:
-        """True if the paper's effect holds, False if its opposite does; None if neither is known.
+        """True if the paper's effect holds, False if the opposite effect holds; None if undecided.
 
-        The verdict decides; for a cost, which has no verdict, the sign does, beyond the noise of times.
+        The verdict decides. A cost has no verdict, so the sign decides, except for times within noise.
         """
         if self.effect is None or not self.paper_effect or not self.effect.mean or self.effect.within_noise:
             return None
@@ -105,15 +105,14 @@ class Row:
 
     Attributes:
         label: the variant's label.
-        branch: whose errors are shown.
-        against: the label of its control; None for the sweep's control and for rows with only the paper's
-            values.
-        note: a remark; None for none.
-        found: the seeds of its finished runs.
-        wanted: the seeds that it should have; empty for a row with only the paper's values.
-        cells: its cells by mode and metric.
-        pairing: in words, which variant is its control in every cell of the axes; empty if it has a single
-            control.
+        branch: the branch that the errors belong to.
+        against: the control's label; None for the sweep's control and for rows with only values from the
+            paper.
+        note: a remark, or None.
+        found: the seeds of finished runs.
+        wanted: the planned seeds; empty for a row with only values from the paper.
+        cells: the cells by mode and metric.
+        pairing: a text that describes the controls in a sweep over axes; empty for a single control.
     """
 
     label: str
@@ -126,8 +125,8 @@ class Row:
     pairing: str = ""
 
     @property
-    def paper_only(self) -> bool:
-        """Whether nothing is measured for this row."""
+    def is_paper_only(self) -> bool:
+        """Whether the row has only values from the paper."""
         return not self.wanted
 
 
@@ -138,18 +137,17 @@ class Table:
     Attributes:
         name: the sweep's name.
         title: the sweep's title.
-        number: the table's number in the paper; None if it is not the paper's.
-        modes: the modes of evaluation; a single one if only costs are shown.
+        number: the table's number in the paper; None for other tables.
+        modes: the evaluation modes; a single mode if only costs are shown.
         metrics: the columns.
-        control: the label of the variant with which variants are compared that name no other control.
-        branch_source: how we know which branch the paper's values belong to; None if it prints none.
+        control: the label of the default control.
+        branch_source: evidence for the branch of the paper's values; None without such values.
         smallest: the smallest effect of interest by metric.
         comparisons: the number of p-values in the correction.
         rows: the variants.
         notes: remarks on the paper's values.
-        flags: what a reader has to know about these runs.
-        analyses: the number of seeds and the level of each interim analysis; empty for a fixed number of
-            seeds.
+        flags: warnings about the runs.
+        analyses: number of seeds and level of each interim analysis; empty for a fixed number of seeds.
     """
 
     name: str
@@ -168,30 +166,30 @@ class Table:
 
     @property
     def measured_metrics(self) -> tuple[str, ...]:
-        """The columns that are errors, not costs."""
+        """The error metrics among the columns, without costs."""
         return tuple(metric for metric in self.metrics if metric not in COSTS)
 
-    def effects(self, mode: str) -> Iterator[tuple[Row, str, Cell, Effect]]:
-        """Yield the effects of a mode that have a verdict, with their rows, metrics and cells."""
+    def list_effects(self, mode: str) -> Iterator[tuple[Row, str, Cell, Effect]]:
+        """Yield row, metric, cell and effect for each effect with a verdict in a mode."""
         for row in self.rows:
             for metric, cell in row.cells[mode].items():
                 if cell.effect is not None and cell.effect.verdict is not None:
                     yield row, metric, cell, cell.effect
 
-    def verdicts(self, mode: str) -> Counter[Verdict]:
-        """Count, by verdict, the effects of a mode for which the paper prints one, too."""
-        found = (effect.verdict for _, _, cell, effect in self.effects(mode) if cell.paper_effect)
+    def count_verdicts(self, mode: str) -> Counter[Verdict]:
+        """Count the verdicts on effects that the paper prints, in a mode."""
+        found = (effect.verdict for _, _, cell, effect in self.list_effects(mode) if cell.paper_effect)
         return Counter(verdict for verdict in found if verdict is not None)
 
-    def detectable(self, mode: str, metric: str) -> float | None:
-        """Return the smallest difference that every comparison would have found with 80 % power.
+    def find_detectable(self, mode: str, metric: str) -> float | None:
+        """Return the smallest difference that every comparison detects with 80 % power; None if unknown.
 
-        Comparisons that could not have found anything, such as those with one seed, are left out (`blind`).
+        Blind comparisons are left out (`list_blind_variants`).
         """
-        known = [effect.detectable for _, name, _, effect in self.effects(mode) if name == metric]
+        known = [effect.detectable for _, name, _, effect in self.list_effects(mode) if name == metric]
         return max((one for one in known if one is not None), default=None)
 
-    def blind(self, mode: str, metric: str) -> list[str]:
-        """Return the labels of the variants whose comparison could not have found any difference."""
+    def list_blind_variants(self, mode: str, metric: str) -> list[str]:
+        """Return the labels of variants that cannot detect any difference, such as with one seed."""
         found = [(row.label, row.cells[mode][metric].effect) for row in self.rows]
         return [label for label, effect in found if effect is not None and effect.detectable is None]

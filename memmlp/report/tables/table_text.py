@@ -1,4 +1,4 @@
-"""A table as text: its words, and Markdown, LaTeX, JSON or lines on a terminal made of them."""
+"""Formats a table as Markdown, LaTeX, JSON or text for a terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.console import Console
 from memmlp.common.files import make_json_safe
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table import STEADY, Cell, Row, Table
+from memmlp.report.tables.table import MAX_TIME_RATIO, Cell, Row, Table
 from memmlp.sweep.definition import COSTS
 
 COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB"}
@@ -24,9 +24,9 @@ MINUS = "\N{MINUS SIGN}"
 ARROWS = {"lower": "↓", "higher": "↑"}
 
 
-GAP = "  "  # stands between columns on a terminal
-LABEL = 18  # the largest width of the variants' column on a terminal, characters
-TEX = {
+COLUMN_GAP = "  "  # text between columns on a terminal
+MAX_LABEL_WIDTH = 18  # maximum width of the variant column on a terminal, characters
+TEX_ESCAPES = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", MINUS: "$-$",
     "↓": r"$\downarrow$", "↑": r"$\uparrow$", "✓": r"$\checkmark$", "✗": r"$\times$",
@@ -34,12 +34,12 @@ TEX = {
 }  # fmt: skip
 
 Line = tuple[tuple[str, ...], ...]
-"""A line of a variant: its cells, each with one to three parts. First come variant and seeds."""
+"""A line of cells: variant, seeds, and one cell for each metric. A cell has one to three parts."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The lines of one mode of evaluation, variant by variant; `mode` is None if it makes no difference."""
+    """The lines of an evaluation mode, grouped by variant; `mode` is None if modes do not matter."""
 
     mode: str | None
     header: tuple[str, ...]
@@ -54,31 +54,31 @@ class Grid:
 def make_grids(table: Table) -> list[Grid]:
     """Return a grid for each mode.
 
-    There is a single grid without a mode if all modes would show the same: costs alone, or nothing measured.
+    If the table has only costs or no results, there is a single grid without a mode.
     """
     timeless = set(table.metrics) <= set(COSTS) or not any(row.found for row in table.rows)
     header = ("variant", "seeds", *map(make_heading, table.metrics))
     found = []
     for mode in table.modes[:1] if timeless else table.modes:
-        groups = tuple(tuple(_lines(table, row, mode)) for row in table.rows)
+        groups = tuple(tuple(_make_lines(table, row, mode)) for row in table.rows)
         found.append(Grid(None if timeless else mode, header, groups))
     return found
 
 
 def make_heading(metric: str) -> str:
-    """Return a metric's name with its unit and the direction that is better."""
+    """Return a metric's name with its unit and an arrow for the better direction."""
     return f"{add_unit(metric)} {ARROWS.get(find_direction(metric), '')}".rstrip()
 
 
 def add_unit(metric: str) -> str:
-    """Return a metric's name with its unit in brackets; the name alone if it has no unit."""
+    """Return a metric's name with its unit, if any, in brackets."""
     return f"{metric} [{find_unit(metric)}]" if find_unit(metric) else metric
 
 
 def find_direction(metric: str) -> str:
-    """Return whether "lower" or "higher" values of a metric are better; empty if that is unknown.
+    """Return "lower" or "higher", the better direction of a metric; empty for an unknown custom metric.
 
-    It is unknown for a custom metric whose package is not in use.
+    A custom metric is unknown if its package is not in use.
     """
     if metric not in UNITS and metric not in COSTS:
         return ""
@@ -86,24 +86,24 @@ def find_direction(metric: str) -> str:
 
 
 def find_unit(metric: str) -> str:
-    """Return a metric's unit; empty for a metric without one."""
+    """Return a metric's unit; empty for a metric without a unit."""
     return UNITS.get(metric, COST_UNITS.get(metric, "")).replace("10^2", "10²").replace("s^3", "s³")
 
 
 def make_caption(table: Table) -> str:
-    """Return the table's title, with its number in the paper."""
+    """Return the table's title, with the paper's table number if any."""
     return f"Table {table.number}: {table.title}" if table.number else table.title
 
 
 def make_legend(table: Table) -> list[str]:
-    """Return the lines that explain the table: whose errors it shows, and how to read the measured values."""
-    lines = [_branch(table)] if table.measured_metrics else []
+    """Return the lines that explain branches, measured values, verdicts and statistical power."""
+    lines = [_describe_branch(table)] if table.measured_metrics else []
     if not any(row.found for row in table.rows):
         return lines
     if table.measured_metrics:
         lines.append("mean ± sd over seeds of the means over test clips")
-    if any(True for mode in table.modes for _ in table.effects(mode)):
-        lines += [_differences(table), _meanings(table)]
+    if any(True for mode in table.modes for _ in table.list_effects(mode)):
+        lines += [_explain_differences(table), _explain_verdicts(table)]
         if table.analyses:
             parts = [f"{seeds} ({100 * level:.2g} %)" for seeds, level in sorted(set(table.analyses))]
             lines.append(
@@ -111,16 +111,16 @@ def make_legend(table: Table) -> list[str]:
                 f"{', '.join(parts)} seeds, which share the 5 %; (3): decided at 3 seeds, and final; means "
                 "and intervals use all seeds"
             )
-        lines += _power(table)
+        lines += _describe_power(table)
     if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
-        lines.append(_agreement(table))
+        lines.append(_summarize_agreement(table))
     return lines
 
 
-def _branch(table: Table) -> str:
-    """Say which branch the rows show, and how we know that the paper's values belong to it."""
-    branches = [row.branch for row in table.rows if not row.paper_only]
-    # The most frequent branch of all rows, the first of several.
+def _describe_branch(table: Table) -> str:
+    """Describe the branches of the rows, and the evidence for the branch of the paper's values."""
+    branches = [row.branch for row in table.rows if not row.is_paper_only]
+    # The most frequent branch; the first branch if several are equally frequent.
     most = max(dict.fromkeys(branches), key=lambda branch: sum(row.branch == branch for row in table.rows))
     others = [f"'{row.label}' {row.branch}" for row in table.rows if row.branch != most]
     parts = [most, ", ".join(others)] if len(set(branches)) > 1 else [most]
@@ -128,7 +128,7 @@ def _branch(table: Table) -> str:
     return f"errors of the branch: {'; '.join(parts)}{source}"
 
 
-def _differences(table: Table) -> str:
+def _explain_differences(table: Table) -> str:
     own = [
         row.pairing or f"'{row.label}' from '{row.against}'"
         for row in table.rows
@@ -143,7 +143,7 @@ def _differences(table: Table) -> str:
     )
 
 
-def _meanings(table: Table) -> str:
+def _explain_verdicts(table: Table) -> str:
     margins = [
         f"{metric} {format_number(table.smallest[metric])} {find_unit(metric)}"
         for metric in table.measured_metrics
@@ -156,18 +156,22 @@ def _meanings(table: Table) -> str:
     )
 
 
-def _power(table: Table) -> list[str]:
+def _describe_power(table: Table) -> list[str]:
     lines = []
     for metric in table.measured_metrics:
-        least = {mode: value for mode in table.modes if (value := table.detectable(mode, metric)) is not None}
+        least = {
+            mode: value for mode in table.modes if (value := table.find_detectable(mode, metric)) is not None
+        }
         parts = []
         for mode, value in least.items():
-            means = [cell.mean for _, name, cell, _ in table.effects(mode) if name == metric]
+            means = [cell.mean for _, name, cell, _ in table.list_effects(mode) if name == metric]
             finite = [mean for mean in means if mean is not None and math.isfinite(mean)]
             if value <= max(finite, default=0.0):
                 parts.append(f"{format_number(value)} ({mode})")
         if parts:
-            blind = dict.fromkeys(label for mode in least for label in table.blind(mode, metric))
+            blind = dict.fromkeys(
+                label for mode in least for label in table.list_blind_variants(mode, metric)
+            )
             but = f" but {', '.join(repr(label) for label in blind)}" if blind else ""
             lines.append(
                 f"{metric}: a true difference of {' or '.join(parts)} {find_unit(metric)} would have been "
@@ -180,26 +184,23 @@ def _power(table: Table) -> list[str]:
     return lines
 
 
-def _agreement(table: Table) -> str:
+def _summarize_agreement(table: Table) -> str:
     mode, costs = table.modes[0], set(table.metrics) & set(COSTS)
-    found = table.verdicts(mode)
+    found = table.count_verdicts(mode)
     counts = ", ".join(f"{found[verdict]} {verdict}" for verdict in Verdict if found[verdict])
     summary = f"; of {sum(found.values())} effects in {mode} mode: {counts}" if found else ""
     signs = "; of a cost by its sign" if costs else ""
     cells = [cell for row in table.rows for cells in row.cells.values() for cell in cells.values()]
     if any(cell.paper_effect and cell.effect and cell.effect.within_noise for cell in cells):
-        signs += f", of a time from x {STEADY:g} on"
+        signs += f", of a time from x {MAX_TIME_RATIO:g} on"
     return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){summary}"
 
 
-def _lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
-    """Yield a variant's lines: measured values, their difference from the control, and the paper's values.
-
-    A row with only the paper's values has just the last line.
-    """
+def _make_lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
+    """Yield a variant's lines: measured values, differences from the control, and the paper's values."""
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
     paper = tuple((format_paper(cell, metric),) for cell, metric in cells)
-    if row.paper_only:
+    if row.is_paper_only:
         yield ((row.label,), ("paper",), *paper)
         return
     values = ((format_value(cell, metric),) for cell, metric in cells)
@@ -211,7 +212,7 @@ def _lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
 
 
 def format_value(cell: Cell, metric: str) -> str:
-    """Return mean ± standard deviation over seeds; for costs other than the column `ms` only the mean."""
+    """Return mean ± standard deviation over seeds; only the mean for costs, except for the column `ms`."""
     if cell.mean is None:
         return MISSING
     if metric in COSTS and (metric != "ms" or cell.sd is None):
@@ -222,26 +223,25 @@ def format_value(cell: Cell, metric: str) -> str:
 
 
 def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
-    """Return the parts of a difference's cell: the difference, its interval and its verdict.
+    """Return the parts of a cell: difference, interval and verdict; for a cost, difference and ratio.
 
-    A significant difference has a star. For a cost, the parts are the difference and the ratio to the
-    control.
+    A significant difference has a star. The ratio is that of a variant's cost to the control's cost.
     """
     effect = cell.effect
     if effect is None:
         return (MISSING,)
     if metric in COSTS:
-        return format_significant(effect.mean, 3, "+").replace("-", MINUS) if effect.mean else "0", *_ratio(
-            cell.mean, effect.mean
-        )
+        return format_significant(effect.mean, 3, "+").replace(
+            "-", MINUS
+        ) if effect.mean else "0", *_format_ratio(cell.mean, effect.mean)
     least = 2 if cell.mean is None else count_decimals(cell.mean)
     if effect.low is None or effect.high is None:
         return (format_signed(effect.mean, f"+.{least}f"),)
     digits = count_interval_decimals(effect.high - effect.low, least)
-    if effect.significant and effect.mean:  # a star beside zeros alone would say nothing
+    if effect.is_significant and effect.mean:  # show at least one digit that is not zero
         digits = max(digits, -math.floor(math.log10(abs(effect.mean))))
     low, high = (format_signed(number, f".{digits}f") for number in (effect.low, effect.high))
-    star = "*" if effect.significant else ""
+    star = "*" if effect.is_significant else ""
     at = f" ({effect.decided})" if effect.decided else ""
     verdict = () if effect.verdict is None else (f"{effect.verdict}{at}",)
     return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict
@@ -253,34 +253,34 @@ def format_number(value: float) -> str:
 
 
 def format_significant(value: float, digits: int, sign: str = "") -> str:
-    """Return a number with so many significant digits; large ones are whole, without an exponent."""
+    """Return a number with `digits` significant digits; large numbers are whole, without an exponent."""
     words = f"{value:{sign}.{digits}g}"
     return f"{value:{sign}.0f}" if "e+" in words else words
 
 
-def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
+def _format_ratio(value: float | None, difference: float) -> tuple[str, ...]:
     if value is None or value == difference:
         return ()
     return (f"(x {format_significant(value / (value - difference), 3)})",)
 
 
 def format_signed(number: float, form: str) -> str:
-    """Return a number in a format, with a typographic minus; "0" for zero."""
+    """Format a number with a typographic minus; zero gives "0"."""
     return format(number, form).replace("-", MINUS) if number else "0"
 
 
 def count_decimals(value: float) -> int:
-    """Return the decimals of an error: 2, or enough to show two digits of an error below 0.1."""
+    """Return the number of decimals of an error: 2, or enough for two significant digits below 0.1."""
     return max(1 - math.floor(math.log10(abs(value))), 2) if value and math.isfinite(value) else 2
 
 
 def count_interval_decimals(width: float, least: int = 2) -> int:
-    """Return the decimals, `least` or one more, that show two digits of half an interval's width."""
+    """Return `least` or `least` + 1 decimals, to show two significant digits of an interval's half width."""
     return min(max(1 - math.floor(math.log10(width / 2)), least), least + 1) if width > 0 else least
 
 
 def format_paper(cell: Cell, metric: str) -> str:
-    """Return the paper's value, its difference from the control, and whether it holds here."""
+    """Return the paper's value, its difference from the control, and ✓ or ✗ if measured results decide."""
     if cell.paper is None:
         return MISSING
     digits = 1 if metric in ("ms", "network ms", "pose ms", "FPS") else 2
@@ -288,7 +288,11 @@ def format_paper(cell: Cell, metric: str) -> str:
     if cell.paper_effect is None:
         return value
     mark = {None: "", True: " ✓", False: " ✗"}[cell.agrees]
-    ratio = "".join(f" {words}" for words in _ratio(cell.paper, cell.paper_effect)) if metric in COSTS else ""
+    ratio = (
+        "".join(f" {words}" for words in _format_ratio(cell.paper, cell.paper_effect))
+        if metric in COSTS
+        else ""
+    )
     return f"{value} ({format_signed(cell.paper_effect, f'+.{digits}f')}{mark}){ratio}"
 
 
@@ -300,52 +304,54 @@ def to_markdown(table: Table) -> str:
         rows += [list(map(escape_markdown, line)) for line in grid.lines]
         text = "\n".join(f"| {' | '.join(row)} |" for row in rows)
         parts.append(f"**{grid.mode}**\n\n{text}" if grid.mode else text)
-    remarks = "\n".join(f"- {escape_markdown(line)}" for line in _remarks(table))
+    remarks = "\n".join(f"- {escape_markdown(line)}" for line in _list_remarks(table))
     return "\n\n".join([*parts, remarks] if remarks else parts) + "\n"
 
 
 def escape_markdown(text: str) -> str:
-    """Return the text with all characters escaped that Markdown would interpret."""
+    """Escape all characters that Markdown would interpret."""
     return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
 
 
 def to_latex(table: Table) -> str:
     """Return a LaTeX table for the packages booktabs and amssymb."""
     lines = ["% needs \\usepackage{booktabs,amssymb}", r"\begin{table}", r"\centering", r"\small"]
-    lines.append(rf"\caption{{{_tex(make_caption(table))}}}")
+    lines.append(rf"\caption{{{_escape_tex(make_caption(table))}}}")
     lines.append(rf"\begin{{tabular}}{{ll{'r' * len(table.metrics)}}}")
     lines.append(r"\toprule")
     for number, grid in enumerate(make_grids(table)):
         columns = len(grid.header)
         lines += [r"\midrule"] if number else []
         lines += [rf"\multicolumn{{{columns}}}{{l}}{{\emph{{{grid.mode} mode}}}} \\"] if grid.mode else []
-        lines += [" & ".join(map(_tex, grid.header)) + r" \\", r"\midrule"]
-        lines += [" & ".join(map(_tex, line)) + r" \\" for line in grid.lines]
+        lines += [" & ".join(map(_escape_tex, grid.header)) + r" \\", r"\midrule"]
+        lines += [" & ".join(map(_escape_tex, line)) + r" \\" for line in grid.lines]
     lines += [r"\bottomrule", r"\end{tabular}"]
-    lines += [rf"\par\smallskip\raggedright\footnotesize {_tex(line)}." for line in _remarks(table)]
+    lines += [
+        rf"\par\smallskip\raggedright\footnotesize {_escape_tex(line)}." for line in _list_remarks(table)
+    ]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
 
 
 def to_json(table: Table) -> str:
-    """Return the table's whole content as JSON, including the values of each seed."""
+    """Return the table's content as JSON, including the values of each seed."""
     fields = asdict(table)
-    for row, words in zip(table.rows, fields["rows"], strict=True):
+    for row, row_fields in zip(table.rows, fields["rows"], strict=True):
         for mode, cells in row.cells.items():
             for metric, cell in cells.items():
                 summary = {"mean": cell.mean, "sd": cell.sd, "agrees": cell.agrees}
-                words["cells"][mode][metric] |= summary
+                row_fields["cells"][mode][metric] |= summary
     return json.dumps(make_json_safe(fields), indent=2, ensure_ascii=False) + "\n"
 
 
-def show(table: Table, console: Console) -> None:
-    """Print the table on a terminal; columns that do not fit are put into further blocks below."""
+def print_table(table: Table, console: Console) -> None:
+    """Print the table on a terminal; columns that do not fit go into additional blocks below."""
     console.print(make_caption(table), style="bold", soft_wrap=True)
     for grid in make_grids(table):
         if grid.mode:
             console.print(f"{grid.mode} mode", style="italic")
-        for columns in _fitting(grid, console.width):
-            console.out("\n".join(_lined(grid, columns)), "", sep="\n", highlight=False)
-    for line in _remarks(table):
+        for columns in _divide_columns(grid, console.width):
+            console.out("\n".join(_format_lines(grid, columns)), "", sep="\n", highlight=False)
+    for line in _list_remarks(table):
         console.print(f"- {line}")
     console.print()
 
@@ -353,22 +359,23 @@ def show(table: Table, console: Console) -> None:
 FORMATS: dict[str, Callable[[Table], str]] = {"md": to_markdown, "tex": to_latex, "json": to_json}
 
 
-def _remarks(table: Table) -> list[str]:
+def _list_remarks(table: Table) -> list[str]:
     return [*make_legend(table), *table.flags, *table.notes]
 
 
-def _tex(text: str) -> str:
-    return "".join(TEX.get(letter, letter) for letter in text)
+def _escape_tex(text: str) -> str:
+    return "".join(TEX_ESCAPES.get(letter, letter) for letter in text)
 
 
-def _fitting(grid: Grid, width: int) -> list[list[int]]:
-    """Divide the metrics' columns into as few groups of nearly equal size as fit the width.
+def _divide_columns(grid: Grid, width: int) -> list[list[int]]:
+    """Divide the metric columns into groups of similar size that fit the width.
 
-    The variants' two columns are repeated before each group.
+    The first two columns (variant, seeds) precede each group.
     """
     columns = range(2, len(grid.header))
     widths = [
-        _width(block[column] for block in _blocks(grid)) + len(GAP) for column in range(len(grid.header))
+        _find_width(block[column] for block in _make_blocks(grid)) + len(COLUMN_GAP)
+        for column in range(len(grid.header))
     ]
     for groups in range(1, len(columns) + 1):
         size = -(-len(columns) // groups)
@@ -378,41 +385,41 @@ def _fitting(grid: Grid, width: int) -> list[list[int]]:
     return fits
 
 
-def _lined(grid: Grid, columns: Sequence[int]) -> Iterator[str]:
-    """Yield some columns of a grid as lines. (Rich's table takes seconds for hundreds of variants.)"""
-    blocks = [[block[i] for i in (0, 1, *columns)] for block in _blocks(grid)]
-    widths = [_width(block[i] for block in blocks) for i in range(len(columns) + 2)]
+def _format_lines(grid: Grid, columns: Sequence[int]) -> Iterator[str]:
+    """Yield a grid's columns as lines of text. Rich's tables are too slow for hundreds of variants."""
+    blocks = [[block[i] for i in (0, 1, *columns)] for block in _make_blocks(grid)]
+    widths = [_find_width(block[i] for block in blocks) for i in range(len(columns) + 2)]
     for number, block in enumerate(blocks):
         for words in itertools.zip_longest(*block, fillvalue=""):
             padded = [
                 word.ljust(widths[i]) if i < 2 else word.rjust(widths[i]) for i, word in enumerate(words)
             ]
-            yield GAP.join(padded).rstrip()
+            yield COLUMN_GAP.join(padded).rstrip()
         if number == 0:
-            yield "─" * (sum(widths) + len(GAP) * (len(widths) - 1))
+            yield "─" * (sum(widths) + len(COLUMN_GAP) * (len(widths) - 1))
         elif len(block[1]) > 1:
             yield ""
 
 
-def _width(parts: Iterable[Sequence[str]]) -> int:
+def _find_width(parts: Iterable[Sequence[str]]) -> int:
     return max(len(word) for part in parts for word in part)
 
 
-def _blocks(grid: Grid) -> list[list[Sequence[str]]]:
-    return [list(map(_header, grid.header)), *map(_block, grid.groups)]
+def _make_blocks(grid: Grid) -> list[list[Sequence[str]]]:
+    return [list(map(_split_header, grid.header)), *map(_make_block, grid.groups)]
 
 
-def _block(group: Sequence[Line]) -> list[Sequence[str]]:
-    """Return a variant's columns, each as words below each other."""
+def _make_block(group: Sequence[Line]) -> list[Sequence[str]]:
+    """Return the columns of a variant, as lists of lines."""
     columns: list[list[str]] = [[] for _ in group[0][1:]]
     for _, *cells in group:
         height = max(map(len, cells))
         for column, parts in zip(columns, cells, strict=True):
             column += [*parts, *[""] * (height - len(parts))]
-    return [textwrap.wrap(group[0][0][0], LABEL), *columns]
+    return [textwrap.wrap(group[0][0][0], MAX_LABEL_WIDTH), *columns]
 
 
-def _header(name: str) -> list[str]:
+def _split_header(name: str) -> list[str]:
     metric, _, rest = name.partition(" [")
     unit, _, arrow = rest.partition("] ")
     return [f"{metric} {arrow}", unit] if rest else [name]

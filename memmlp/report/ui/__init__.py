@@ -1,1 +1,1 @@
-"""`memmlp ui`: runs, sweeps and searches on a page of this machine, which is updated while they run."""
+"""`memmlp ui`: a local web page of runs, sweeps and searches, with updates while they run."""

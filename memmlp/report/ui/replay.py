@@ -14,24 +14,24 @@ from memmlp.common.errors import InputError
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
 from memmlp.motion.limb_shapes import HEAT, LIMBS
-from memmlp.report.pictures.clip_pictures import colour_scale_top
+from memmlp.report.pictures.clip_pictures import find_colour_scale_top
 from memmlp.runs.run import Run
 
 Predict = Callable[[Run, str, str], Mapping[str, np.ndarray]]
-"""Gives "true_positions" and "predicted_positions" (N, 22, 3), metres, of a run's test clip in a mode."""
+"""Computes "true_positions" and "predicted_positions" (N, 22, 3), metres, from a run, clip and mode."""
 
-SECONDS = 10  # the length of the piece around the worst second
-PAGE_AXES = SPACES["openxr"]  # those of three.js
-GAP = 0.5  # least seconds between two of a clip's worst seconds
-WORST = 3  # number of a clip's worst seconds
-MAX_KEPT = 64  # predictions in memory
+PIECE_SECONDS = 10  # default length of a piece
+PAGE_AXES = SPACES["openxr"]  # also the axes of three.js
+MIN_GAP_SECONDS = 0.5  # minimum time between two of the worst seconds
+WORST_SECONDS = 3  # number of worst seconds of a clip
+MAX_PREDICTIONS = 64  # maximum number of predictions in memory
 
 Motion = tuple[np.ndarray, np.ndarray]
 """Truth and prediction (N, 22, 3), metres, world."""
 
 
 class Replays:
-    """Makes replays one after the other.
+    """Computes replays, one at a time.
 
     Args:
         outputs: the folder of runs and caches.
@@ -50,27 +50,32 @@ class Replays:
         clip: str,
         mode: str,
         begin: float | None = None,
-        seconds: float = SECONDS,
+        seconds: float = PIECE_SECONDS,
         timeout: float | None = 0.2,
     ) -> dict[str, Any]:
-        """Return a piece of a replay (`cut_piece`), or that it is being computed.
+        """Return a piece of a replay (`cut_piece`), or the state of its computation.
 
         Args:
             run_id: a finished run's id.
             clip: a test clip's name.
             mode: "stream" or "window".
-            begin: where the piece begins, seconds; None for a piece around the worst second.
-            seconds: the piece's length.
-            timeout: the seconds to wait for the prediction; None to wait until it is there.
+            begin: start of the piece, seconds; None for a piece around the worst second.
+            seconds: length of the piece.
+            timeout: maximum wait for the prediction, seconds; None for no limit.
 
         Returns:
             `state` is "computing", "failed" (with `reason`) or "ready".
         """
         run = Run.from_id(self.outputs, run_id)
-        key = (run_id, clip, mode, run.marker.stat().st_mtime_ns if run.done else 0)  # the run may be redone
+        key = (
+            run_id,
+            clip,
+            mode,
+            run.marker.stat().st_mtime_ns if run.done else 0,
+        )  # changes when it is redone
         with self.lock:
             if key not in self.motions:
-                if len(self.motions) >= MAX_KEPT:
+                if len(self.motions) >= MAX_PREDICTIONS:
                     del self.motions[next(iter(self.motions))]
                 self.motions[key] = self.worker.submit(self._predict, run, clip, mode)
             future = self.motions[key]
@@ -78,7 +83,7 @@ class Replays:
             truth, prediction = future.result(timeout)
         except TimeoutError:
             return {"state": "computing"}
-        except Exception as error:  # the page shows it and may ask again; the server goes on
+        except Exception as error:  # the page shows the error and may retry
             self.motions.pop(key, None)
             reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
             return {"state": "failed", "reason": reason}
@@ -89,31 +94,31 @@ class Replays:
         return arrays["true_positions"], arrays["predicted_positions"]
 
     def close(self) -> None:
-        """Cancel the computations that are still waiting."""
+        """Cancel the waiting computations."""
         self.worker.shutdown(wait=False, cancel_futures=True)
 
 
 def describe_body() -> dict[str, Any]:
-    """Return what a page needs in order to draw a person."""
+    """Return limbs, heat colours, joints and frame rate, which a page needs to draw a person."""
     limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
     return {"limbs": limbs, "heat": HEAT, "joints": JOINTS, "fps": FPS}
 
 
 def cut_piece(
-    truth: np.ndarray, prediction: np.ndarray, begin: float | None = None, seconds: float = SECONDS
+    truth: np.ndarray, prediction: np.ndarray, begin: float | None = None, seconds: float = PIECE_SECONDS
 ) -> dict[str, Any]:
     """Return a piece of a clip for a page.
 
     Args:
         truth, prediction: joint positions (N, 22, 3), metres, world.
-        begin: where the piece begins, seconds; None for a piece around the worst second.
-        seconds: the piece's length, seconds.
+        begin: start of the piece, seconds; None for a piece around the worst second.
+        seconds: length of the piece.
 
     Returns:
-        `errors`, the mean error over the joints for each frame of the clip, cm; `worst`, the worst seconds,
-        each with its first frame and its mean error, cm; and from frame `from` on, `truth` and `joints` as
-        whole millimetres in the page's axes, 66 per frame. A prediction with NaN can't be shown: then `state`
-        is "failed" (with `reason`).
+        `errors` has the mean error over joints for each frame of the clip, cm. `worst` lists the worst
+        seconds with first frame and mean error, cm. `truth` and `joints` have 66 integers per frame from
+        frame `from` on: millimetres in the page's axes. If the prediction contains NaN, `state` is "failed"
+        and `reason` describes why.
     """
     bad = np.flatnonzero(~np.isfinite(prediction).all((1, 2)))
     if bad.size:
@@ -128,14 +133,14 @@ def cut_piece(
     piece = slice(first, first + length)
     return {
         "state": "ready", "fps": FPS, "frames": len(truth), "from": first, "worst": worst,
-        "top": colour_scale_top(distances), "mean": round(float(errors.mean()), 3),
+        "top": find_colour_scale_top(distances), "mean": round(float(errors.mean()), 3),
         "errors": np.round(errors, 2).tolist(),
-        "truth": _millimetres(truth[piece]), "joints": _millimetres(prediction[piece]),
+        "truth": _convert_to_millimetres(truth[piece]), "joints": _convert_to_millimetres(prediction[piece]),
     }  # fmt: skip
 
 
 def find_worst_seconds(errors: np.ndarray) -> list[dict[str, Any]]:
-    """Return the worst seconds of a clip, the worst first, without overlaps.
+    """Return a clip's worst seconds without overlaps, the largest error first.
 
     Args:
         errors: the mean error of each frame (N,), cm.
@@ -143,14 +148,14 @@ def find_worst_seconds(errors: np.ndarray) -> list[dict[str, Any]]:
     width = min(FPS, len(errors))
     means = np.convolve(errors, np.ones(width) / width, "valid")
     found: list[dict[str, Any]] = []
-    while len(found) < WORST and np.isfinite(means).any() and means.max() > -np.inf:
+    while len(found) < WORST_SECONDS and np.isfinite(means).any() and means.max() > -np.inf:
         first = int(means.argmax())
         found.append({"first": first, "mean": round(float(means[first]), 3)})
-        gap = width + round(GAP * FPS)
+        gap = width + round(MIN_GAP_SECONDS * FPS)
         means[max(first - gap + 1, 0) : first + gap] = -np.inf
     return found
 
 
-def _millimetres(joints: np.ndarray) -> list[list[int]]:
+def _convert_to_millimetres(joints: np.ndarray) -> list[list[int]]:
     positions = PAGE_AXES.convert_positions_from_amass(np.asarray(joints, np.float64))
     return (1000 * positions).round().astype(int).reshape(len(joints), -1).tolist()

@@ -1,4 +1,4 @@
-"""`memmlp report`: the page as one file, with the answers about some sweeps, their runs, and all searches."""
+"""`memmlp report`: the page as one file, with selected sweeps, their runs, and all searches."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.report.ui.page_files import one_file
+from memmlp.report.ui.page_files import make_single_file
 from memmlp.report.ui.runs import read_curves, thin_out
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import KnownSweep
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
-MAX_POINTS = 120  # of a curve, about
-MAX_CLIPS = 60  # of a run, its worst
-MAX_REPLAYS = 4  # in the file
+MAX_POINTS = 120  # approximate maximum number of points of a curve
+MAX_CLIPS = 60  # maximum number of clips of a run
+MAX_REPLAYS = 4  # maximum number of replays
 REPLAY_SECONDS = 4
-ERROR = "stream.rotation.MPJPE"  # by which the best run of a sweep is found
-CURVES = ("train loss", "val rotation ", "val position MPJPE", "val loss")  # beginnings of names
-LONG_FACTS = ("source", "attempts", "prerequisite_runs")  # of a manifest, left out
+ERROR = "stream.rotation.MPJPE"  # metric that selects a sweep's best run
+CURVES = ("train loss", "val rotation ", "val position MPJPE", "val loss")  # prefixes of curve names
+LONG_FACTS = ("source", "attempts", "prerequisite_runs")  # prefixes of manifest keys that are left out
 
 
 def write_page(answers: Answers, names: Collection[str], about: str, replays: bool = True) -> str:
@@ -30,13 +30,13 @@ def write_page(answers: Answers, names: Collection[str], about: str, replays: bo
 
     Args:
         answers: answers about the outputs folder.
-        names: the sweeps to show, with their runs: files, numbers of the paper's tables, or names of folders
-            below outputs/sweeps; all sweeps if there are none.
-        about: when and by which code the file is made.
-        replays: whether the worst seconds of the best runs are computed and shown.
+        names: the sweeps to show, with their runs: sweep files, table numbers from the paper, or folder names
+            in outputs/sweeps. All sweeps if empty.
+        about: date and code version of the page.
+        replays: whether to compute and show the worst seconds of the best runs.
 
     Raises:
-        InputError: if there is no sweep with a given name, or no sweep at all.
+        InputError: if a sweep is not found, or there are no sweeps.
     """
     answers.refresh()
     shown = _select_sweeps(answers, names)
@@ -50,26 +50,26 @@ def write_page(answers: Answers, names: Collection[str], about: str, replays: bo
         "sweeps": {"sweeps": [row for row in sweeps if row["name"] in shown], "damaged": {}},
         "searches": answers.searches.list_rows(),
         **{f"sweeps/{name}": answers.sweeps.describe(name) for name in shown},
-        **{f"searches/{name}": answers.searches.describe(name) for name in answers.searches.names()},
-        **{f"run/{run_id}": _shorten(answers.answer(f"run/{run_id}", {})) for run_id in sorted(ids)},
+        **{f"searches/{name}": answers.searches.describe(name) for name in answers.searches.list_names()},
+        **{f"run/{run_id}": _shorten_run_page(answers.answer(f"run/{run_id}", {})) for run_id in sorted(ids)},
     }
     if replays:
         planned = [[entry.id for entry in known.plan.entries] for known in shown.values()]
         found |= _replay_best_runs(answers, planned, found)
-    return one_file(round_numbers(found))
+    return make_single_file(round_numbers(found))
 
 
 def _select_sweeps(answers: Answers, names: Collection[str]) -> dict[str, KnownSweep]:
     known = answers.sweeps.known
-    folder, expected = answers.outputs / "sweeps", ", ".join(known) or "none; memmlp sweep makes them"
+    folder = answers.outputs / "sweeps"
     if not known:
-        raise InputError(f"{folder}: has {expected}")
+        raise InputError(f"{folder}: contains no sweeps; make them with: memmlp sweep")
     shown: dict[str, KnownSweep] = {}
     for name in names:
         stem = f"table{int(name):02}" if name.isdigit() else Path(name).stem
         found = {one: known[one] for one in known if one == stem or one.startswith(f"{stem}-")}
         if not found:
-            raise InputError(f"{name}: not found in {folder}, which has {expected}")
+            raise InputError(f"{name}: must be a sweep in {folder}: {', '.join(known)}")
         shown |= found
     return shown or known
 
@@ -82,15 +82,15 @@ def _read_curves(run: Run) -> dict[str, Any]:
     }
 
 
-def _shorten(page: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's page with the worst clips alone, and a short manifest."""
+def _shorten_run_page(page: Mapping[str, Any]) -> dict[str, Any]:
+    """Keep only the clips with the largest errors on a run's page, and shorten the manifest."""
     manifest = {key: value for key, value in page["manifest"].items() if not key.startswith(LONG_FACTS)}
-    clips = sorted(page["clips"], key=_error, reverse=True)[:MAX_CLIPS]
+    clips = sorted(page["clips"], key=_find_sort_error, reverse=True)[:MAX_CLIPS]
     return {**page, "clips": clips, "manifest": manifest}
 
 
-def _error(clip: Mapping[str, Any]) -> float:
-    """Return a clip's error for sorting: infinite if it is NaN, 0 if the clip was not evaluated."""
+def _find_sort_error(clip: Mapping[str, Any]) -> float:
+    """Return a clip's error for sorting; infinity for NaN, and 0 for a clip without results."""
     for mode in MODES:
         if (value := clip.get(mode, {}).get("rotation", {}).get("MPJPE")) is not None:
             return float(value) if math.isfinite(float(value)) else math.inf
@@ -100,7 +100,7 @@ def _error(clip: Mapping[str, Any]) -> float:
 def _replay_best_runs(
     answers: Answers, sweeps: Iterable[list[str]], pages: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the worst seconds of the worst clip of each sweep's best run, and its control's of that clip."""
+    """Return replays of each sweep's best run and its control, on the clip with the largest error."""
     found: dict[str, Any] = {}
     for ids in sweeps:
         runs = [answers.index.runs[run_id] for run_id in ids if run_id in answers.index.runs]
@@ -120,12 +120,12 @@ def _replay_best_runs(
 
 
 def encode_query(**values: str) -> str:
-    """Return a query encoded as a browser's URLSearchParams encodes it."""
+    """Encode a query like URLSearchParams in a browser."""
     return urllib.parse.urlencode(values).replace("~", "%7E").replace("%2A", "*")
 
 
 def round_numbers(value: Any) -> Any:
-    """Return a value with all its numbers rounded to six digits; NaN and infinities become None."""
+    """Round all numbers in a value to six significant digits; NaN and infinity become None."""
     if isinstance(value, Mapping):
         return {str(key): round_numbers(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

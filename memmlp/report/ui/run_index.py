@@ -1,4 +1,4 @@
-"""The runs below an outputs folder, as the page lists them; a run is read again when its files change."""
+"""The runs in an outputs folder, for the page's list. A run is read again when its files change."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, find_tra
 from memmlp.runs.lookup import get_run_name
 from memmlp.runs.run import Run, name_latency
 
-HIDDEN = ("paths", "loggers", "force", "hydra", "save_predictions")
-"""Config groups that are not listed."""
+HIDDEN_GROUPS = ("paths", "loggers", "force", "hydra", "save_predictions")
+"""Config groups that the page does not list."""
 
-USE = {*EVALUATION, *DEPLOYMENT, *(key.split(".")[0] for key in INFERENCE)}
-"""Config groups that say how a trained network is evaluated and deployed."""
+USE_GROUPS = {*EVALUATION, *DEPLOYMENT, *(key.split(".")[0] for key in INFERENCE)}
+"""Config groups for evaluation and deployment of a trained network."""
 
 COSTS = {
     "median_ms": "ms", "p95_ms": "ms", "pose_median_ms": "ms", "ratio_to_yardstick": "", "parameters": "",
     "macs": "", "onnx_bytes": "",
 }  # fmt: skip
-"""The listed costs of a deployment, with units; lower is better."""
+"""Listed costs of a deployment, with units. Lower values are better."""
 
 FILES = ("config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "results.json", "notes.json")
-TAIL = 1 << 14  # bytes at the end of a metrics log in which the last entries are looked for
-RECENT = 5  # number of training entries from which the speed of a run is estimated
+TAIL_BYTES = 1 << 14  # number of bytes at the end of a metrics log that are searched for recent entries
+RECENT_ENTRIES = 5  # number of training entries for the estimate of a run's speed
 
 
 class RunIndex:
@@ -50,29 +50,29 @@ class RunIndex:
         self.runs: dict[str, dict[str, Any]] = {}
 
     def refresh(self) -> str:
-        """Look at all run folders again, and return a text that changes with any of them."""
+        """Read changed run folders, and return a text that changes when any run changes."""
         try:
             folders = [entry for entry in (self.outputs / "runs").iterdir() if ID.fullmatch(entry.name)]
         except (FileNotFoundError, NotADirectoryError):
             folders = []
-        self.runs = {folder.name: self._look(folder) for folder in folders if folder.is_dir()}
+        self.runs = {folder.name: self._read_run(folder) for folder in folders if folder.is_dir()}
         return repr([(run_id, facts["signature"], facts["status"]) for run_id, facts in self.runs.items()])
 
-    def _look(self, folder: Path) -> dict[str, Any]:
-        signature, facts = _signature(folder), self.runs.get(folder.name)
+    def _read_run(self, folder: Path) -> dict[str, Any]:
+        signature, facts = _make_signature(folder), self.runs.get(folder.name)
         if facts is None or facts["signature"] != signature:
             facts = read_facts(folder) | {"signature": signature}
         return {**facts, "status": _read_status(folder)}
 
 
 def read_facts(folder: Path) -> dict[str, Any]:
-    """Return what is listed of a run; `damage` names the files that cannot be read."""
+    """Return the facts of a run for the page's list; `damage` lists unreadable files."""
     run, damage = Run(folder), list[str]()
     if not (manifest := run.manifest):
         damage.append("manifest.json")
     if not (config := read_config(run)):
         damage.append("config.yaml")
-    listed = select_listed(config)
+    listed = select_listed_values(config)
     git, seconds = (
         found if isinstance(found := manifest.get(key), dict) else {} for key in ("git", "seconds")
     )
@@ -81,23 +81,23 @@ def read_facts(folder: Path) -> dict[str, Any]:
     return {
         "id": run.id,
         "name": get_run_name(manifest, listed),
-        "kind": _text(manifest.get("kind")),
+        "kind": _convert_to_text(manifest.get("kind")),
         "done": run.done,
-        "started": _text(manifest.get("started")),
-        "finished": _text(manifest.get("finished")),
+        "started": _convert_to_text(manifest.get("started")),
+        "finished": _convert_to_text(manifest.get("finished")),
         "seconds": sum(numbers) if numbers else None,
-        "code": _text(git.get("commit") or manifest.get("version"))[:7],
-        "data": _text(manifest.get("data"))[:8],
-        "data_name": _text(listed.get("data.name")),
-        "device": _text(manifest.get("gpu")) or _text(manifest.get("device")),
-        "prerequisite": _text(manifest.get("prerequisite")),
-        "steps": _total_steps(manifest.get("kind"), config),
-        "recent": read_recent(run.metrics_path),
+        "code": _convert_to_text(git.get("commit") or manifest.get("version"))[:7],
+        "data": _convert_to_text(manifest.get("data"))[:8],
+        "data_name": _convert_to_text(listed.get("data.name")),
+        "device": _convert_to_text(manifest.get("gpu")) or _convert_to_text(manifest.get("device")),
+        "prerequisite": _convert_to_text(manifest.get("prerequisite")),
+        "steps": _find_total_steps(manifest.get("kind"), config),
+        "recent": read_recent_entries(run.metrics_path),
         "config": listed,
-        "metrics": _read_metrics(run, {key: config[key] for key in USE if key in config}, damage),
-        "failure": _text(read_json(folder / "FAILED").get("reason")),
+        "metrics": _read_metrics(run, {key: config[key] for key in USE_GROUPS if key in config}, damage),
+        "failure": _convert_to_text(read_json(folder / "FAILED").get("reason")),
         "tags": [str(tag) for tag in notes["tags"]] if isinstance(notes.get("tags"), list) else [],
-        "note": _text(notes.get("note")),
+        "note": _convert_to_text(notes.get("note")),
         "damage": damage,
     }  # fmt: skip
 
@@ -110,20 +110,20 @@ def read_config(run: Run) -> dict[str, Any]:
         return {}
 
 
-def select_listed(config: Mapping[str, Any]) -> dict[str, Any]:
+def select_listed_values(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return a config's listed values by dotted key."""
     return {
         key: value
         for key, value in make_json_safe(flatten(config)).items()
-        if key.split(".")[0] not in HIDDEN and not key.endswith(("._target_", "._partial_"))
+        if key.split(".")[0] not in HIDDEN_GROUPS and not key.endswith(("._target_", "._partial_"))
     }
 
 
-def read_recent(path: Path) -> list[list[Any]]:
-    """Return step, time and loss of a metrics log's last training entries, the newest last."""
+def read_recent_entries(path: Path) -> list[list[Any]]:
+    """Return step, time and loss of the last training entries in a metrics log, the newest last."""
     try:
         with open(path, "rb") as file:
-            file.seek(max(file.seek(0, 2) - TAIL, 0))
+            file.seek(max(file.seek(0, 2) - TAIL_BYTES, 0))
             lines = file.read().split(b"\n")[:-1]
     except OSError:
         return []
@@ -133,13 +133,13 @@ def read_recent(path: Path) -> list[list[Any]]:
         if entry and entry["phase"] == "train":
             loss = entry["values"].get("loss", math.nan)
             found.append([entry["step"], entry["time"], loss if math.isfinite(loss) else None])
-        if len(found) == RECENT:
+        if len(found) == RECENT_ENTRIES:
             break
     return found[::-1]
 
 
 def parse_line(line: bytes) -> dict[str, Any] | None:
-    """Return the entry in a line of a metrics log, its values as numbers; None if it does not hold one."""
+    """Parse a line of a metrics log, with values as numbers; return None for an invalid line."""
     try:
         entry = json.loads(line)
         values = {str(key): float(value) for key, value in entry["values"].items()}
@@ -149,7 +149,7 @@ def parse_line(line: bytes) -> dict[str, Any] | None:
     return {"step": step, "phase": phase, "time": time, "values": values}
 
 
-def _total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
+def _find_total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
     try:
         steps = find_training_settings(str(kind), config)["steps"]
     except (KeyError, TypeError):
@@ -158,7 +158,7 @@ def _total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
 
 
 def _read_metrics(run: Run, config: Mapping[str, Any], damage: list[str]) -> dict[str, float]:
-    """Return the measured numbers by dotted name, such as "stream.rotation.MPJPE"."""
+    """Return metrics and costs by dotted name, such as "stream.rotation.MPJPE"."""
     found: dict[str, Any] = {}
     try:
         evaluations = EvaluationsAsConfigured(run.evaluations, config)
@@ -182,8 +182,8 @@ def _read_status(folder: Path) -> str:
         return "stopped"
 
 
-def _signature(folder: Path) -> str:
-    """Return a text that changes when any file changes from which a run's facts come."""
+def _make_signature(folder: Path) -> str:
+    """Return a text that changes when a file with facts of the run changes."""
     stats = _stat_files(folder, FILES) + _stat_files(folder / "evaluations")
     with contextlib.suppress(OSError):
         for name in os.listdir(folder / "deployments"):
@@ -192,7 +192,7 @@ def _signature(folder: Path) -> str:
 
 
 def _stat_files(folder: Path, names: tuple[str, ...] | None = None) -> list[tuple[str, str, int, int]]:
-    """Return name, time and size of a folder's files, either of certain names or all."""
+    """Return folder name, file name, time and size of a folder's files, or only of the named files."""
     found = []
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
@@ -202,5 +202,5 @@ def _stat_files(folder: Path, names: tuple[str, ...] | None = None) -> list[tupl
     return found
 
 
-def _text(value: object) -> str:
+def _convert_to_text(value: object) -> str:
     return "" if value is None or isinstance(value, dict | list) else str(value)

@@ -1,4 +1,4 @@
-"""The answers about runs: the table's rows, a run's page, and curves."""
+"""The server's answers about runs: rows of the run table, a run's page, and curves."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import make_json_safe, read_json
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.table_text import find_direction, find_unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, parse_line, read_config
 from memmlp.runs.deployment_folder import select_deployed_measurements
@@ -20,28 +20,28 @@ from memmlp.runs.identity import NETWORK, NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import count_training_frames, is_trained, warn_if_hardly_trained
 from memmlp.runs.run import Run
 
-VIEWABLE = (
+VIEWABLE_FILES = (
     "config.yaml", "manifest.json", "metrics.jsonl", "code.patch", "FAILED", "notes.json", "poses.png",
 )  # fmt: skip
-"""Files of a run that the page may open unchanged."""
+"""Run files that the page may show without changes."""
 
 MAX_FILES = 200
-MAX_POINTS = 400  # of a curve, about
+MAX_POINTS = 400  # approximate maximum number of points of a curve
 
-ROW = (
+ROW_FACTS = (
     "id", "name", "kind", "status", "started", "finished", "seconds", "device", "tags", "note", "failure",
     "damage", "data", "data_name", "code", "steps", "recent", "signature",
 )  # fmt: skip
-"""The facts of a run that its row has."""
+"""The facts of a run in its table row."""
 
 Places = Mapping[str, Sequence[Mapping[str, Any]]]
-"""By run id, the sweeps and searches that use the run."""
+"""The sweeps and searches that use a run, by run id."""
 
 
 def list_rows(index: RunIndex, places: Places) -> dict[str, Any]:
-    """Return a row for each run; `keys` and `metrics` name the values of its `config` and `metrics`."""
+    """Return a row for each run. `keys` and `metrics` are the column names of `config` and `metrics`."""
     runs = index.runs
-    keys = differing_keys(runs.values())
+    keys = find_differing_keys(runs.values())
     metrics = list(dict.fromkeys(metric for run in runs.values() for metric in run["metrics"]))
     minor = [name for name in NEUTRAL if name != "data"]
     return {
@@ -52,20 +52,20 @@ def list_rows(index: RunIndex, places: Places) -> dict[str, Any]:
         "units": describe_units(metrics),
         "rows": [
             {
-                **{key: run[key] for key in ROW},
+                **{key: run[key] for key in ROW_FACTS},
                 "places": list(places.get(run_id, [])),
                 "config": [run["config"].get(key) for key in keys],
-                "metrics": [_round(run["metrics"].get(metric), 6) for metric in metrics],
+                "metrics": [_round_value(run["metrics"].get(metric), 6) for metric in metrics],
             }
             for run_id, run in runs.items()
         ],
     }
 
 
-def differing_keys(runs: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the config keys in which runs differ, in the order of the configs.
+def find_differing_keys(runs: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return the config keys with different values between runs, in the order of the configs.
 
-    Paths of data differ only if the data differs, since one folder has several spellings.
+    Data paths count as equal if the data is equal, because a folder has several spellings.
     """
     first: dict[str, Any] = {}
     counts: dict[str, int] = defaultdict(int)
@@ -75,17 +75,17 @@ def differing_keys(runs: Iterable[Mapping[str, Any]]) -> list[str]:
         total += bool(run["config"])
         for key, value in run["config"].items():
             counts[key] += 1
-            meant = run["data"] if is_data_path(key) else value
-            if first.setdefault(key, meant) != meant:
+            compared = run["data"] if is_data_path(key) else value
+            if first.setdefault(key, compared) != compared:
                 differing.add(key)
     return [key for key in first if key in differing or (counts[key] < total and not is_data_path(key))]
 
 
 def describe_units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return the units of metrics, and which direction is better, by the last word of the metrics' names.
+    """Return unit and better direction of metrics, by the last part of the dotted name.
 
-    `better` is "lower" or "higher", or empty for a number that is not an error, such as the truth's Jitter.
-    A custom metric is left out if its package is not in use.
+    `better` is "lower" or "higher". It is empty for a number that is not an error, such as the truth's
+    Jitter. Custom metrics are left out if their package is not in use.
     """
     found = {}
     for metric in dict.fromkeys(dotted.rpartition(".")[2] for dotted in metrics):
@@ -100,13 +100,13 @@ def describe_units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
 
 
 def describe_run(index: RunIndex, run_id: str, control: str | None, places: Places) -> dict[str, Any]:
-    """Return everything that a run's page shows. Raises KeyError for an unknown run.
+    """Return the content of a run's page. Raises KeyError for an unknown run.
 
     Args:
         index: the runs.
         run_id: the run's id.
-        control: the id of the run with which its variant is compared; None for none.
-        places: the sweeps and searches by run.
+        control: the run id of the control with the same seed, or None.
+        places: the sweeps and searches by run id.
     """
     facts, run = index.runs[run_id], Run.from_id(index.outputs, run_id)
     config = _read_flat_config(run)
@@ -124,7 +124,7 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         "clips": read_clips(run),
         "latency": _read_latency(run),
         "changed": run.verify() if run.done else [],
-        "outdated": outdated_modes(run),
+        "outdated": list_outdated_modes(run),
         "remark": _warn_of_short_training(run) if facts["kind"] == NETWORK and not facts["damage"] else "",
         "files": _list_files(run.folder),
     }
@@ -135,11 +135,11 @@ def _read_flat_config(run: Run) -> dict[str, Any]:
 
 
 def read_clips(run: Run) -> list[dict[str, Any]]:
-    """Return the errors of each test clip by mode and branch; empty if they can't be read."""
+    """Return each test clip's errors by mode and branch; empty if results can't be read."""
     if not is_trained(run):
         return []
     try:
-        found, evaluations = load(run.folder).clips, run.evaluations_as_configured
+        found, evaluations = load_measured_run(run.folder).clips, run.evaluations_as_configured
         solvers = evaluations.combined_solvers
         frames = {
             report["name"]: report.get("frames")
@@ -159,7 +159,7 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
 
 
 def _read_latency(run: Run) -> dict[str, Any]:
-    """Return the measurements of the deployment that the run's config asks for."""
+    """Return the measurements of the deployment in the run's config."""
     try:
         record = select_deployed_measurements(run.deployment_as_configured.record)
     except InputError:
@@ -167,11 +167,11 @@ def _read_latency(run: Run) -> dict[str, Any]:
     return {key: value for key, value in flatten(record).items() if isinstance(value, int | float | str)}
 
 
-def outdated_modes(run: Run) -> list[str]:
-    """Return the modes that an earlier component version measured, each with the changes since."""
+def list_outdated_modes(run: Run) -> list[str]:
+    """Return modes with results from an earlier component version, each with the changes since."""
     try:
         return [f"{mode} ({changes})" for mode, changes in run.evaluations_as_configured.outdated.items()]
-    except InputError:  # the facts name the damaged file
+    except InputError:  # `damage` in the facts lists the file
         return []
 
 
@@ -188,14 +188,14 @@ def _list_files(folder: Path) -> list[dict[str, Any]]:
         {
             "name": str(path.relative_to(folder)),
             "bytes": path.stat().st_size,
-            "viewable": path.name in VIEWABLE and path.parent == folder,
+            "viewable": path.name in VIEWABLE_FILES and path.parent == folder,
         }
         for path in paths[:MAX_FILES]
     ]
 
 
 def read_curves(run: Run) -> dict[str, Any]:
-    """Return a run's curves by name, such as "train loss": [steps, values]; None is a missing number."""
+    """Return a run's curves by name, such as "train loss": [steps, values]; None for NaN or infinity."""
     try:
         stat = run.metrics_path.stat()
     except OSError:
@@ -214,20 +214,20 @@ def _parse_log(path: Path, *stamp: int) -> dict[str, Any]:
 
 
 def thin_out(points: Mapping[int, float | None], most: int = MAX_POINTS) -> list[list[Any]]:
-    """Return steps and values; of many, only the smallest and the largest in each stretch."""
+    """Return steps and values. If there are over `most` points, keep minimum and maximum of each interval."""
     pairs = sorted(points.items())
     if len(pairs) > most:
         size = math.ceil(2 * len(pairs) / most)
         stretches = [range(start, min(start + size, len(pairs))) for start in range(0, len(pairs), size)]
-        order = [_order(value) for _, value in pairs]
+        order = [_make_sort_value(value) for _, value in pairs]
         ends = {end(stretch, key=order.__getitem__) for stretch in stretches for end in (min, max)}
         pairs = [pairs[i] for i in sorted({0, len(pairs) - 1} | ends)]
-    return [[step for step, _ in pairs], [_round(value, 5) for _, value in pairs]]
+    return [[step for step, _ in pairs], [_round_value(value, 5) for _, value in pairs]]
 
 
-def _order(value: float | None) -> float:
+def _make_sort_value(value: float | None) -> float:
     return value if value is not None and math.isfinite(value) else math.inf
 
 
-def _round(value: float | None, digits: int) -> float | None:
+def _round_value(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else float(f"{value:.{digits}g}")

@@ -1,4 +1,4 @@
-"""The answers about searches: trials with values and parameters, importance, Pareto front."""
+"""The server's answers about searches: trials, parameter importance, Pareto front."""
 
 from __future__ import annotations
 
@@ -17,51 +17,51 @@ if TYPE_CHECKING:
 
 
 class Searches:
-    """The searches below an outputs folder.
+    """The searches in an outputs folder.
 
-    A search is read again when its journal has grown. One in a storage of the user's is read again after its
-    controller's last sign of life.
+    A search is read again when its journal changes. A search in a custom storage is read again when its
+    controller writes a sign of life.
     """
 
     def __init__(self, outputs: Path):
         self.outputs = outputs
         self.pages: dict[str, tuple[int, dict[str, Any]]] = {}
 
-    def names(self) -> list[str]:
-        """Return the names of the searches' folders, the most recently changed first."""
-        stamps = {path.name: _changed(path) for path in self.outputs.glob("tune/*/")}
+    def list_names(self) -> list[str]:
+        """Return the folder names of the searches, the last changed first."""
+        stamps = {path.name: _find_change_time(path) for path in self.outputs.glob("tune/*/")}
         return sorted(filter(stamps.get, stamps), key=lambda name: -stamps[name])
 
-    def stamp(self) -> str:
+    def make_stamp(self) -> str:
         """Return a text that changes when any search changes."""
-        return repr([(name, _changed(self.outputs / "tune" / name)) for name in self.names()])
+        return repr([(name, _find_change_time(self.outputs / "tune" / name)) for name in self.list_names()])
 
-    def runs(self) -> Iterator[tuple[str, int, str]]:
-        """Yield a search's name, a trial's number and the id of one of its runs, for all of them."""
-        for name in self.names():
+    def list_runs(self) -> Iterator[tuple[str, int, str]]:
+        """Yield search name, trial number and run id for each run of each trial."""
+        for name in self.list_names():
             for trial in self.describe(name).get("trials", ()):
                 for run_id in trial["runs"]:
                     yield name, trial["number"], run_id
 
     def list_rows(self) -> dict[str, Any]:
-        """Return a row for each search; the row of an unreadable one has an `error`."""
+        """Return a row for each search; an unreadable search has an `error`."""
         keys = ("name", "title", "error", "objectives", "wanted", "counts", "best")
-        pages = map(self.describe, self.names())
+        pages = map(self.describe, self.list_names())
         return {"searches": [{key: page.get(key) for key in keys} for page in pages]}
 
     def describe(self, name: str) -> dict[str, Any]:
-        """Return everything that a search's page shows. Raises KeyError for an unknown search."""
-        if name not in self.names():
+        """Return the content of a search's page. Raises KeyError for an unknown search."""
+        if name not in self.list_names():
             raise KeyError(name)
         folder = self.outputs / "tune" / name
-        stamp, known = _changed(folder), self.pages.get(name)
+        stamp, known = _find_change_time(folder), self.pages.get(name)
         if known is None or known[0] != stamp:
-            known = self.pages[name] = (stamp, _describe(folder))
+            known = self.pages[name] = (stamp, _describe_search(folder))
         return known[1]
 
 
-def _changed(folder: Path) -> int:
-    """Return when a search last changed, in nanoseconds; 0 if the folder does not hold a search."""
+def _find_change_time(folder: Path) -> int:
+    """Return the time of a search's last change, nanoseconds; 0 if the folder does not contain a search."""
     journal = folder / "study.journal"
     signs = [journal] if journal.exists() else folder.glob("controllers/*.json")
     times = [0]
@@ -73,7 +73,7 @@ def _changed(folder: Path) -> int:
     return max(times)
 
 
-def _describe(folder: Path) -> dict[str, Any]:
+def _describe_search(folder: Path) -> dict[str, Any]:
     import optuna
 
     from memmlp.sweep.search.study import open_storage
@@ -121,7 +121,7 @@ def _describe_trial(trial: FrozenTrial) -> dict[str, Any]:
 
     from memmlp.sweep.search.study import reason
 
-    # Optuna gives a pruned trial the value of its last step, which is not a result.
+    # For a pruned trial, Optuna has the value of the last step, which is not a result.
     values = trial.values if trial.state == TrialState.COMPLETE else []
     return {
         "number": trial.number,

@@ -1,4 +1,4 @@
-"""The server of the page: files, and answers as JSON. No request can change a run."""
+"""The page's server. It sends files and JSON answers; no request can change a run."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from memmlp.runs.identity import ID
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
-MAX_CURVES = 60  # runs with curves in one answer
+MAX_CURVES = 60  # maximum number of runs in an answer with curves
 
 
 class Answers:
-    """Answers the page's questions about an outputs folder.
+    """Answers the page's requests about an outputs folder.
 
     Args:
         outputs: the folder of runs and caches.
         predict: computes a run's prediction for a test clip.
-        pause: the least number of seconds between two looks at the folder.
+        pause: minimum time between two scans of the folder, seconds.
     """
 
     def __init__(self, outputs: Path, predict: Predict, pause: float = 1.0):
@@ -49,36 +49,36 @@ class Answers:
         self.state, self.next_look = "", 0.0
 
     def refresh(self) -> str:
-        """Look at everything again, and return a text that changes whenever anything has changed.
+        """Scan the folder, and return a text that changes when any run, sweep or search changes.
 
-        However many pages ask, looking takes at most a tenth of the time.
+        Scans take at most a tenth of the time, however many pages are open.
         """
         with self.lock:
             started = time.monotonic()
             if started >= self.next_look:
-                found = self.index.refresh(), self.sweeps.refresh(), self.searches.stamp()
+                found = self.index.refresh(), self.sweeps.refresh(), self.searches.make_stamp()
                 self.state = digest(found)[:16]
                 ended = time.monotonic()
                 self.next_look = ended + max(self.pause, 9 * (ended - started))
             return self.state
 
-    def places(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the sweeps and searches that use a run, by run id."""
+    def list_places(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the sweeps and searches by run id."""
         found: dict[str, list[dict[str, Any]]] = {}
         for name, known in self.sweeps.known.items():
             for entry in known.plan.entries:
                 place = {"sweep": name, "variant": entry.label, "seed": entry.seed}
                 found.setdefault(entry.id, []).append(place)
-        for search, number, run_id in self.searches.runs():
+        for search, number, run_id in self.searches.list_runs():
             found.setdefault(run_id, []).append({"search": search, "trial": number})
         return found
 
     def answer(self, path: str, query: Mapping[str, str]) -> Mapping[str, Any]:
-        """Return the answer to a question, such as "run/0123456789abcdef".
+        """Return the answer to a request with a path such as "run/0123456789abcdef".
 
         Raises:
-            KeyError: if there is nothing with that name.
-            ValueError: for a text that should be a number.
+            KeyError: if the path is unknown.
+            ValueError: if the query has an invalid value.
         """
         state = self.refresh()
         kind, _, name = path.partition("/")
@@ -86,7 +86,7 @@ class Answers:
             case "runs", False:
                 if query.get("state") == state:
                     return {"state": state}
-                rows = runs.list_rows(self.index, self.places())
+                rows = runs.list_rows(self.index, self.list_places())
                 return {**rows, "state": state, "outputs": str(self.outputs.absolute())}
             case "curves", False:
                 known = [one for one in ID.findall(query.get("runs", "")) if one in self.index.runs]
@@ -100,42 +100,42 @@ class Answers:
                 return self.searches.describe(name) if name else self.searches.list_rows()
             case (("run" | "replay"), True) if ID.fullmatch(name) and name in self.index.runs:
                 if kind == "replay":
-                    return self._replay(name, query)
-                return runs.describe_run(self.index, name, self.sweeps.find_control(name), self.places())
+                    return self._get_replay(name, query)
+                return runs.describe_run(self.index, name, self.sweeps.find_control(name), self.list_places())
         raise KeyError(path)
 
-    def missing(self, path: str) -> str:
-        """Return a message that there is nothing with that name, and where it would be."""
+    def describe_missing(self, path: str) -> str:
+        """Return an error message for an unknown path, with the searched folder."""
         kind, _, name = path.partition("/")
         folders = {"run": "runs", "replay": "runs", "sweeps": "sweeps", "searches": "tune"}
         if kind not in folders or not name:
-            return f"{path}: there is no such page"
+            return f"{path}: not found"
         return f"{name}: not found in {self.outputs / folders[kind]}; is it in another outputs folder?"
 
-    def _replay(self, run_id: str, query: Mapping[str, str]) -> dict[str, Any]:
+    def _get_replay(self, run_id: str, query: Mapping[str, str]) -> dict[str, Any]:
         mode = query.get("mode", MODES[0])
         if mode not in MODES or "clip" not in query:
-            raise ValueError(f"mode={mode}: must be {' or '.join(MODES)}, with a clip")
+            raise ValueError(f"mode={mode}: must be {' or '.join(MODES)}, and clip must be given")
         begin = float(query["from"]) if query.get("from") else None
         return self.replays.get(run_id, query["clip"], mode, begin)
 
     def close(self) -> None:
-        """Cancel the computations that are still waiting."""
+        """Cancel the waiting computations."""
         self.replays.close()
 
 
 class RunsHandler(PageHandler):
-    """Answers one request."""
+    """Handles one request to the page's server."""
 
     server: RunsServer
     protocol_version = "HTTP/1.1"  # keeps connections open
 
     def answer(self, path: str, query: Mapping[str, str]) -> None:
-        """Send a file of the page, an answer, or a file of a run."""
+        """Send a page file, an answer, or a run file."""
         kind, _, name = path.partition("/")
         if path in ("", *page_files.FILES):
             file = path or "index.html"
-            self.send(200, find_content_type(file), page_files.read(file))
+            self.send(200, find_content_type(file), page_files.read_file(file))
         elif kind == "api":
             self._send_answer(name, query)
         elif kind == "files":
@@ -147,10 +147,10 @@ class RunsHandler(PageHandler):
         try:
             found = self.server.answers.answer(path, query)
         except KeyError:
-            self._send_json(404, {"error": self.server.answers.missing(path)})
+            self._send_json(404, {"error": self.server.answers.describe_missing(path)})
         except (InputError, ValueError, OverflowError) as error:
             self._send_json(400, {"error": str(error)})
-        except Exception as error:  # one damaged folder must not look like the server's end
+        except Exception as error:  # a damaged folder must not stop the server
             self._send_json(500, {"error": f"{type(error).__name__}: {error}"})
         else:
             self._send_json(200, found)
@@ -164,7 +164,7 @@ class RunsHandler(PageHandler):
 
     def _send_run_file(self, run_id: str, name: str) -> None:
         path = self.server.answers.outputs / "runs" / run_id / name
-        if not ID.fullmatch(run_id) or name not in runs.VIEWABLE or not path.is_file():
+        if not ID.fullmatch(run_id) or name not in runs.VIEWABLE_FILES or not path.is_file():
             self._send_json(404, {"error": "not found"})
             return
         kind = "image/png" if name.endswith(".png") else TEXT
@@ -172,16 +172,16 @@ class RunsHandler(PageHandler):
 
 
 class RunsServer(PageServer):
-    """Serves the page, as `PageServer` does.
+    """The page's HTTP server.
 
     Args:
         answers: the answers about runs, sweeps and searches.
-        port, host, token: as in `PageServer`.
+        port, host, token: see `PageServer`.
     """
 
     def __init__(self, answers: Answers, port: int, host: str = HOST, token: str | None = None):
         self.answers = answers
-        policy = build_security_policy(page_files.read("index.html").decode())
+        policy = build_security_policy(page_files.read_file("index.html").decode())
         self.headers = {"Content-Security-Policy": f"{policy}; frame-ancestors 'none'"}
         super().__init__(RunsHandler, port, host, token)
 

@@ -1,4 +1,4 @@
-"""The answers about sweeps: progress, remaining time, and tables with effects and verdicts."""
+"""The server's answers about sweeps: progress, remaining time, and tables with effects and verdicts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import make_json_safe
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.build_table import find_finished_runs, make_table
-from memmlp.report.tables.measured_run import Measured, load
+from memmlp.report.tables.measured_run import MeasuredRun, load_measured_run
 from memmlp.report.tables.seed_rounds import (
     ROUNDS_FILE,
     Rounds,
@@ -34,17 +34,17 @@ from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, load_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import task_name
 
-DAMAGED_ROUNDS = "seeds were spent in rounds that cannot be shown here: these verdicts do not keep the 5 %"
-OTHER_ROUNDS = "seeds were spent in rounds, but not of these runs: these verdicts do not keep the 5 %"
+DAMAGED_ROUNDS = "seed rounds cannot be read: error probabilities of these verdicts may exceed 5 %"
+OTHER_ROUNDS = "seed rounds belong to other runs: error probabilities of these verdicts may exceed 5 %"
 
 
 class KnownSweep(NamedTuple):
-    """A sweep below an outputs folder.
+    """A sweep in an outputs folder.
 
     Attributes:
-        plan: its plan, under the name of the sweep's folder.
-        sweep: its definition.
-        stamp: the times of its files, nanoseconds; it changes with them.
+        plan: the plan, named like the sweep's folder.
+        sweep: the definition.
+        stamp: the modification times of the sweep's files, nanoseconds.
     """
 
     plan: Plan
@@ -53,10 +53,10 @@ class KnownSweep(NamedTuple):
 
 
 class Sweeps:
-    """The sweeps below an outputs folder.
+    """The sweeps in an outputs folder.
 
     Attributes:
-        damaged: why a sweep can't be read, by the name of its folder.
+        damaged: error messages for unreadable sweeps, by folder name.
     """
 
     def __init__(self, index: RunIndex):
@@ -66,11 +66,11 @@ class Sweeps:
         self.results: dict[str, tuple[Any, dict[str, Any]]] = {}
 
     def refresh(self) -> str:
-        """Look at all sweeps again, and return a text that changes when any of them changes."""
+        """Read changed sweeps, and return a text that changes when any sweep changes."""
         known, damaged = {}, {}
         for path in self.index.outputs.glob("sweeps/*/plan.json"):
             folder, name = path.parent, path.parent.name
-            stamp = tuple(_changed(folder / file) for file in (path.name, SWEEP_FILE, ROUNDS_FILE))
+            stamp = tuple(_find_change_time(folder / file) for file in (path.name, SWEEP_FILE, ROUNDS_FILE))
             before = self.known.get(name)
             try:
                 if before and before.stamp == stamp:
@@ -87,15 +87,15 @@ class Sweeps:
         return repr([(name, one.stamp) for name, one in newest])
 
     def list_rows(self) -> dict[str, Any]:
-        """Return a row for each sweep, the most recently changed first."""
+        """Return a row for each sweep, the last changed first."""
         rows = [self.describe_progress(one, self.find_states(one.plan)) for one in self.known.values()]
         return {"sweeps": rows, "damaged": self.damaged}
 
     def describe(self, name: str) -> dict[str, Any]:
-        """Return everything that a sweep's page shows. Raises KeyError for an unknown sweep."""
+        """Return the content of a sweep's page. Raises KeyError for an unknown sweep."""
         known = self.known[name]
         plan, states = known.plan, self.find_states(known.plan)
-        results = self._results(known)
+        results = self._get_results(known)
         values = results["values"]
         return {
             **self.describe_progress(known, states),
@@ -116,7 +116,7 @@ class Sweeps:
         counts = {True: Counter[str](), False: Counter[str]()}
         for task in plan.tasks:
             counts[task.kind == NETWORK][states[task.key]] += 1
-        steps = {task.key: self._steps(task, states[task.key]) for task in plan.tasks}
+        steps = {task.key: self._count_steps(task, states[task.key]) for task in plan.tasks}
         total = sum(number for number, _ in steps.values())
         # An unfinished run has at least one step left: its evaluation may be missing.
         left = sum(max(remaining, states[key] != "done") for key, (_, remaining) in steps.items())
@@ -129,13 +129,13 @@ class Sweeps:
             "counts": dict(counts[True]),
             "prerequisite_counts": dict(counts[False]),
             "share": 1 - left / total if total else 0.0,
-            "remaining": self._remaining_seconds(plan, states, steps),
+            "remaining": self._estimate_remaining_seconds(plan, states, steps),
         }
 
     def find_control(self, run_id: str) -> str | None:
-        """Return the run of the same seed with which a run's variant is compared; None for none.
+        """Return the id of the control's run with the same seed, or None.
 
-        If several sweeps use the run, the first one in which its variant has a control decides.
+        If several sweeps use the run, the first sweep with a control for it decides.
         """
         for plan, sweep, _ in self.known.values():
             ids = {(entry.label, entry.seed): entry.id for entry in plan.entries}
@@ -147,10 +147,10 @@ class Sweeps:
         return None
 
     def find_states(self, plan: Plan) -> dict[str, str]:
-        """Return every task's state by its key, as `Plan.states` does, from the facts in the index."""
-        return plan.with_blocked({task.key: self._state(plan, task) for task in plan.tasks})
+        """Return task states by key, like `Plan.states`, but from the facts in the index."""
+        return plan.with_blocked({task.key: self._find_state(plan, task) for task in plan.tasks})
 
-    def _state(self, plan: Plan, task: RunTask) -> str:
+    def _find_state(self, plan: Plan, task: RunTask) -> str:
         facts = self.index.runs.get(task.id)
         if facts is None:
             return "new"
@@ -167,53 +167,55 @@ class Sweeps:
             "step": recent[-1][0], "steps": facts.get("steps"), "failure": facts.get("failure", ""),
         }  # fmt: skip
 
-    def _steps(self, task: RunTask, state: str) -> tuple[int, int]:
-        """Return the number of a task's training steps, and how many of them remain."""
+    def _count_steps(self, task: RunTask, state: str) -> tuple[int, int]:
+        """Return the total and the remaining number of a task's training steps."""
         facts = self.index.runs.get(task.id) or {}
         total = int(facts.get("steps") or find_training_settings(task.kind, task.config)["steps"] or 0)
         last = facts["recent"][-1][0] if facts.get("recent") else 0
         return total, 0 if state == "done" else max(total - int(last), 0)
 
-    def _remaining_seconds(
+    def _estimate_remaining_seconds(
         self, plan: Plan, states: Mapping[str, str], steps: Mapping[str, tuple[int, int]]
     ) -> float | None:
-        """Return the estimated seconds of training left for the workers that train at present.
+        """Estimate the remaining training time with the current number of busy workers, seconds.
 
-        It is None if no worker trains, or if everything is trained.
+        It is None if no worker trains, or if all networks are trained.
         """
         running = [task for task in plan.tasks if states[task.key] in STAGE_WORDS.values()]
-        paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
+        paces = [
+            pace for task in plan.tasks if (pace := _estimate_pace(self.index.runs.get(task.id))) is not None
+        ]
         if not running or not paces:
             return None
         remaining = sum(left for key, (_, left) in steps.items() if states[key] not in ("failed", "blocked"))
         return remaining * statistics.median(paces) / len(running) if remaining else None
 
-    def _results(self, known: KnownSweep) -> dict[str, Any]:
-        """Return the results of a sweep's runs, computed again after a change of the sweep or of a run."""
+    def _get_results(self, known: KnownSweep) -> dict[str, Any]:
+        """Return the results of a sweep's runs; compute them again if the sweep or a run has changed."""
         with self.lock:
             plan, runs = known.plan, self.index.runs
             stamp = known.stamp, [runs.get(entry.id, {}).get("signature") for entry in plan.entries]
             before = self.results.get(plan.name)
             if before is None or before[0] != stamp:
-                before = self.results[plan.name] = (stamp, self._compute(known))
+                before = self.results[plan.name] = (stamp, self._compute_results(known))
             return before[1]
 
-    def _compute(self, known: KnownSweep) -> dict[str, Any]:
+    def _compute_results(self, known: KnownSweep) -> dict[str, Any]:
         plan, flags = known.plan, list[str]()
         rounds, flag = find_rounds(known.sweep, plan)
-        sweep = rounds.spent(known.sweep) if rounds else known.sweep
+        sweep = rounds.restrict_sweep(known.sweep) if rounds else known.sweep
         entries = {(entry.label, entry.seed): entry for entry in plan.entries}
         metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
         values: dict[tuple[str, int], float] = {}
 
-        def find(variant: Variant, seed: int) -> Measured | None:
+        def find(variant: Variant, seed: int) -> MeasuredRun | None:
             entry = entries.get((variant.label, seed))
             if entry is None or not plan.complete(entry):
                 return None
             try:
-                run = load(plan.run_of(entry).folder, entry.stages)
-                # Variants that share a training may evaluate its network differently.
-                value = run.value("stream", variant.branch, metric)
+                run = load_measured_run(plan.run_of(entry).folder, entry.stages)
+                # Variants with the same trained network may have different evaluations.
+                value = run.get_value("stream", variant.branch, metric)
             except InputError as error:
                 flags.append(str(error))
                 return None
@@ -242,7 +244,7 @@ class Sweeps:
 
 
 def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:
-    """Return the rounds that decided a sweep's verdicts, or None with a flag if other rounds were taken."""
+    """Return the seed rounds of a sweep, or None; a flag reports damaged rounds and rounds of other runs."""
     path = plan.outputs / "sweeps" / plan.name / ROUNDS_FILE
     try:
         rounds = Rounds.read(path)
@@ -257,25 +259,29 @@ def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:
 
 
 def describe_rounds(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
-    """Return the interim analyses of a sweep's rounds with what each decided, and each variant's progress."""
+    """Return the interim analyses with their numbers of decisions, and each variant's progress."""
     analyses = []
     for seeds, level in zip(rounds.schedule, rounds.levels, strict=True):
         found = [finding for one in rounds.analyses if one.seeds == seeds for finding in one.findings]
         decided = sum(finding.verdict is not Verdict.INCONCLUSIVE for finding in found)
         analyses.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
     variants = [asdict(variant) for variant in list_progress(rounds, sweep)]
-    return {"comparisons": len(rounds.comparisons(sweep)), "analyses": analyses, "variants": variants}
+    return {
+        "comparisons": len(rounds.list_comparison_keys(sweep)),
+        "analyses": analyses,
+        "variants": variants,
+    }
 
 
-def _changed(path: Path) -> int:
+def _find_change_time(path: Path) -> int:
     try:
         return path.stat().st_mtime_ns
     except OSError:
         return 0
 
 
-def _pace(facts: Mapping[str, Any] | None) -> float | None:
-    """Return a run's seconds per step over its last entries; None if there are too few of them."""
+def _estimate_pace(facts: Mapping[str, Any] | None) -> float | None:
+    """Return a run's seconds per step, from its last log entries; None if there are too few entries."""
     recent = (facts or {}).get("recent") or []
     if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
         return None

@@ -17,7 +17,7 @@ from live.web.conftest import PERSON, REMARK, Made, package_files
 from memmlp.common.npm import IWER
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Offsets
-from memmlp.report.tables.rows_measured_in_browsers import read
+from memmlp.report.tables.rows_measured_in_browsers import read_bench
 
 pytestmark = pytest.mark.slow
 
@@ -247,7 +247,7 @@ def check_bench(browser: Browser, file: Path) -> None:
     assert "Measured 8 rows" in browser.value("document.querySelector('#progress').textContent")
     browser.value("document.querySelector('#save').click()")
     file.write_text(browser.wait("window.saved"))
-    measured = read(file)
+    measured = read_bench(file)
     assert measured.about["device"] == "Test headset"
     kinds = [(row["network"], row["graph"], row["precision"]) for row in measured.rows]
     graphs = [("naive", "fp32"), ("streaming", "fp32"), ("streaming", "int8"), ("streaming", "fp16")]

@@ -17,9 +17,9 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.report.pictures import clip_pictures
 from memmlp.report.pictures.clip_pictures import (
     ClipPiece,
-    check_picture,
-    colour_scale_top,
-    frame_range,
+    check_picture_path,
+    find_colour_scale_top,
+    find_frame_range,
     write_picture,
 )
 
@@ -94,29 +94,29 @@ def test_an_interrupted_film_leaves_the_last_one(tmp_path, monkeypatch, name: st
 
 def test_bad_files_are_rejected(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    for write in (lambda path: check_picture(path), lambda path: write_picture(path, make_piece(7))):
+    for write in (lambda path: check_picture_path(path), lambda path: write_picture(path, make_piece(7))):
         with pytest.raises(InputError, match=r"memmlp\[video\]"):
             write(tmp_path / "a.mp4")
     with pytest.raises(InputError, match=r"a\.pdf: must end in \.png"):
-        check_picture(tmp_path / "a.pdf")
+        check_picture_path(tmp_path / "a.pdf")
     with pytest.raises(InputError, match="there is no folder"):
-        check_picture(tmp_path / "none" / "a.png")
+        check_picture_path(tmp_path / "none" / "a.png")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_piece_without_frames_is_rejected():
-    assert frame_range(120, "walk", 0.5, None) == (30, 120)
-    assert frame_range(120, "walk", 0.0, 9.0) == (0, 120)
+    assert find_frame_range(120, "walk", 0.5, None) == (30, 120)
+    assert find_frame_range(120, "walk", 0.0, 9.0) == (0, 120)
     for begin, end in ((2.0, None), (1.0, 1.0), (float("nan"), None)):
         with pytest.raises(InputError, match="begin"):
-            frame_range(120, "walk", begin, end)
+            find_frame_range(120, "walk", begin, end)
 
 
 def test_the_camera_follows_the_person():
     moving = ClipPiece("walk", TRUTH + np.linspace(0, 4, 31)[:, None, None] * [1, 0, 0], {"a": TRUTH})
-    apart = moving.path() - moving.truth[:, 0, :2]
+    apart = moving.smooth_camera_path() - moving.truth[:, 0, :2]
     assert np.abs(apart[10:21]).max() < 0.8
-    assert np.ptp(moving.path()[:, 0]) > 1.5
+    assert np.ptp(moving.smooth_camera_path()[:, 0]) > 1.5
 
 
 def test_a_hand_above_the_head_is_in_the_picture():
@@ -124,14 +124,14 @@ def test_a_hand_above_the_head_is_in_the_picture():
     raised[:, 20] = raised[:, 15] + [0.1, 0.1, 0.6]  # the left wrist, and the head
     tall = ClipPiece("clips/one", raised, {"bad": np.full_like(TRUTH, np.nan)})
     for frame in (0, 30):
-        camera = tall.camera(tall.azimuth(frame), raised[frame, 0, :2])
+        camera = tall.make_camera(tall.find_azimuth(frame), raised[frame, 0, :2])
         assert np.abs(camera.project(raised[frame])[:, 1]).max() < tall.metres / 2
     assert ClipPiece("clips/one", TRUTH, {}).metres < tall.metres < 2.9
 
 
 def test_the_scale_is_round_and_leaves_few_above():
     errors = np.random.default_rng(0).gamma(2, 4, 5000)
-    assert colour_scale_top(errors) in (25, 30)
-    assert (errors > colour_scale_top(errors)).mean() <= 0.02
-    assert colour_scale_top(np.zeros(3)) == 10
-    assert colour_scale_top(np.full(3, 1e6)) == 100
+    assert find_colour_scale_top(errors) in (25, 30)
+    assert (errors > find_colour_scale_top(errors)).mean() <= 0.02
+    assert find_colour_scale_top(np.zeros(3)) == 10
+    assert find_colour_scale_top(np.full(3, 1e6)) == 100

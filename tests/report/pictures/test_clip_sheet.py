@@ -41,7 +41,7 @@ def test_bad_files_are_named(folder: Path):
 
 def test_nothing_to_show_is_rejected(folder: Path, tmp_path: Path):
     (folder / "0" / "walk.npz").write_bytes(b"no")
-    with pytest.raises(InputError, match=r"no clip in 1 files.*0/walk\.npz"):
+    with pytest.raises(InputError, match=r"none of 1 files could be read.*0/walk\.npz"):
         read_sample(folder, 1)
     with pytest.raises(InputError, match="No such file"):
         read_sample(tmp_path / "none.npz", 1)

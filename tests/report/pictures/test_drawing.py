@@ -9,7 +9,7 @@ import tiny
 from memmlp.evaluation.modes import extract_positions
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.report.pictures.clip_pictures import ClipPiece
-from memmlp.report.pictures.drawing import Camera, draw_skeleton, fix_layout, get_pixels, make_panels
+from memmlp.report.pictures.drawing import Camera, draw_skeleton, freeze_layout, get_pixels, make_panels
 
 TRUTH = extract_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 WIDTH, HEIGHT = 120, 180
@@ -18,12 +18,12 @@ WIDTH, HEIGHT = 120, 180
 @pytest.fixture
 def camera() -> Camera:
     piece = ClipPiece("clip", TRUTH, {})
-    return piece.camera(piece.azimuth(0), TRUTH[0, 0, :2])
+    return piece.make_camera(piece.find_azimuth(0), TRUTH[0, 0, :2])
 
 
 def draw(camera: Camera, joints: np.ndarray, errors: np.ndarray | None) -> np.ndarray:
     figure, panels = make_panels(WIDTH, HEIGHT, 1, 1)
-    fix_layout(figure)
+    freeze_layout(figure)
     panels[0, 0].set_position((0, 0, 1, 1))
     for _ in range(2):  # the second drawing takes the first one's place
         draw_skeleton(panels[0, 0], camera, joints, errors)

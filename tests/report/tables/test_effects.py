@@ -15,7 +15,7 @@ from fake_table import EFFECTS, cell, printed
 
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.effects import compute_mean_cost
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.statistics import Verdict, correct_by_holm, estimate_paired_effects
 from memmlp.report.tables.table import Table
 from memmlp.runs.evaluation_file import write_report
@@ -32,10 +32,10 @@ def test_difference_is_paired_by_seed_and_clip(sweep: Sweep, tmp_path: Path):
     means = [cell(table, label, "MPJPE").mean for label in ("no | memory", "full_model")]
     assert effect.mean == pytest.approx(means[0] - means[1])
     assert effect.mean == pytest.approx(0.2 * means[1], rel=0.1)
-    assert effect.significant
+    assert effect.is_significant
     assert effect.high - effect.low < 0.5
-    run = load(next((tmp_path / "runs").iterdir()))
-    assert np.ptp(run.by_clip(CLIPS, "stream", "rotation", "MPJPE")) > 1.5
+    run = load_measured_run(next((tmp_path / "runs").iterdir()))
+    assert np.ptp(run.get_clip_values(CLIPS, "stream", "rotation", "MPJPE")) > 1.5
 
 
 def test_correction_is_over_all_modes_and_metrics(table: Table):
@@ -77,7 +77,10 @@ def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
         for label, branch, metric in keys:
             sides = [
                 np.array(
-                    [read.by_clip(CLIPS, mode, b, metric) for read in runs_of(sweep, find)[one].values()]
+                    [
+                        read.get_clip_values(CLIPS, mode, b, metric)
+                        for read in runs_of(sweep, find)[one].values()
+                    ]
                 )
                 for one, b in ((label, branch), ("full_model", "rotation"))
             ]
@@ -129,7 +132,7 @@ def test_one_head_is_told_where_it_diverged_on_a_clip(sweep: Sweep, tmp_path: Pa
     table = make_table(replace(sweep, seeds=(0, 1)).with_branch("combined"), runs)
     rows = {row.label: row.branch for row in table.rows}
     assert (rows["no | memory"], rows["full_model"]) == ("rotation", "combined")
-    assert not runs["full_model"][1].one_branch
+    assert not runs["full_model"][1].has_one_branch
     assert np.isnan(cell(table, "no | memory", "MPJPE").mean)
     assert cell(table, "no | memory", "MPJPE").effect.clips == 11
 
@@ -140,7 +143,7 @@ def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
     for seed in sweep.seeds:
         fake_run(tmp_path, f"{sweep.name} no | memory", seed, branches=["rotation"])
     table = table_of(source, find)
-    rows = {row.label: row.branch for row in table.rows if not row.paper_only}
+    rows = {row.label: row.branch for row in table.rows if not row.is_paper_only}
     assert rows == {"no | memory": "rotation", "by position": "position", "full_model": "combined"}
     assert (
         sum("no other branch, so the row shows rotation: 'no | memory'" in flag for flag in table.flags) == 1
@@ -155,7 +158,7 @@ def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
         "inconclusive",
     }
     run = runs_of(source, find)["full_model"][0]
-    assert cell(table, "full_model", "MPJPE").values[0] == run.value("stream", "combined", "MPJPE")
+    assert cell(table, "full_model", "MPJPE").values[0] == run.get_value("stream", "combined", "MPJPE")
 
 
 def test_a_branch_that_was_not_evaluated_is_no_other(sweep: Sweep, tmp_path: Path):
@@ -164,7 +167,7 @@ def test_a_branch_that_was_not_evaluated_is_no_other(sweep: Sweep, tmp_path: Pat
     table = table_of(sweep.with_branch("combined"), find, command="memmlp sweep 11")
     assert cell(table, "full_model", "MPJPE").mean is None
     assert (
-        "not evaluated in the branch combined: 'no | memory', 'full_model'; do so with: memmlp sweep 11"
+        "not evaluated in the branch combined: 'no | memory', 'full_model'; evaluate with: memmlp sweep 11"
         in (table.flags)
     )
 
@@ -205,14 +208,14 @@ def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(
             report["clips"][1]["rotation"] |= dict.fromkeys(("MPJPE", "MPJRE"), word)
         path.write_text(json.dumps(report))
     table, lost = table_of(sweep, find), ("MPJPE", "MPJRE")
-    assert all(cell(before, "no | memory", metric).effect.significant for metric in (*lost, "Jitter"))
+    assert all(cell(before, "no | memory", metric).effect.is_significant for metric in (*lost, "Jitter"))
     for metric in lost:
         effect = cell(table, "no | memory", metric).effect
-        assert (effect.clips, effect.verdict, effect.significant) == (11, Verdict.INCONCLUSIVE, False)
+        assert (effect.clips, effect.verdict, effect.is_significant) == (11, Verdict.INCONCLUSIVE, False)
         assert (effect.p, effect.equal, effect.detectable) == (None, None, None)
-        assert cell(table, "no | memory", metric, "window").effect.significant
+        assert cell(table, "no | memory", metric, "window").effect.is_significant
     assert cell(table, "no | memory", "Jitter").effect.clips == 11
-    assert cell(table, "no | memory", "Jitter").effect.significant
+    assert cell(table, "no | memory", "Jitter").effect.is_significant
 
 
 def test_equal_costs_differ_by_nothing_however_many_seeds_have_them():

@@ -12,7 +12,7 @@ import pytest
 from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, nothing, runs_of, table_of
 from fake_table import cell, printed
 
-from memmlp.report.kept_results import Kept, dumps, load_kept
+from memmlp.report.kept_results import KeptResults, format_results, load_kept_results
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Table
@@ -59,7 +59,7 @@ def test_a_protocol_on_amass_with_other_data(sweep: Sweep):
     runs = runs_of(sweep, nothing)
     protocol = replace(sweep, table=1, base=("data=amass_s1",))
     other = replace(protocol, command_line=("data=mocap", "data.root=mine"))
-    flag = "a table of data=amass_s1, shown with data=mocap: its errors do not compare with the paper's"
+    flag = "a table of data=amass_s1, shown with data=mocap: errors are not comparable with the paper"
     assert flag in make_table(other, runs).flags
     same = (protocol, replace(protocol, command_line=("data=amass_s1",)), replace(other, base=()))
     assert not any("a table of" in flag for one in same for flag in make_table(one, runs).flags)
@@ -317,8 +317,8 @@ def test_seeds_upon_other_weights_of_one_prerequisite(sweep: Sweep, tmp_path: Pa
     runs = runs_of(sweep, run)
     assert found(runs) == [f"11111111 of {EVERY}; 22222222 of {EVERY}"]
     path = tmp_path / "kept.json"
-    path.write_text(dumps(Kept("table11", (), runs, {})))
-    assert found(load_kept(path).runs) == found(runs)
+    path.write_text(format_results(KeptResults("table11", (), runs, {})))
+    assert found(load_kept_results(path).runs) == found(runs)
     weights[1] = ["1"]
     assert found(runs_of(sweep, run)) == []
 
@@ -417,7 +417,7 @@ def test_intervals_of_one_seed_or_group(
     assert [flag[: len(words)] for flag, words in zip(found, expected, strict=True)] == expected
     if len(clips) == 1:
         effect = cell(table, "no | memory", "MPJPE").effect
-        assert (table.comparisons, effect.significant, effect.verdict) == (0, False, Verdict.INCONCLUSIVE)
+        assert (table.comparisons, effect.is_significant, effect.verdict) == (0, False, Verdict.INCONCLUSIVE)
         assert "*" not in printed(table, 100)
 
 
@@ -465,5 +465,5 @@ def test_warnings_about_the_data(
         replace(sweep, seeds=(0,)), lambda one, seed: fake_run(tmp_path, one.label, origin={fact: warning})
     )
     path = tmp_path / "kept.json"
-    path.write_text(dumps(Kept("5", (), measured, {label: () for label in labels})))
-    assert {getattr(run.origin, fact) for run in load_kept(path).every} == {warning}
+    path.write_text(format_results(KeptResults("5", (), measured, {label: () for label in labels})))
+    assert {getattr(run.origin, fact) for run in load_kept_results(path).all_runs} == {warning}

@@ -13,8 +13,8 @@ from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, table_of
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
-from memmlp.report.kept_results import Kept, dumps, load_kept
-from memmlp.report.tables.measured_run import Measured, load
+from memmlp.report.kept_results import KeptResults, format_results, load_kept_results
+from memmlp.report.tables.measured_run import MeasuredRun, load_measured_run
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import VERSIONS, hash_deployment_settings, list_outdated
 from memmlp.sweep.definition import Sweep
@@ -26,14 +26,14 @@ def test_size_and_times_are_of_the_precision_that_was_asked_for(sweep: Sweep, tm
     record = json.loads(path.read_text()) | {"pose_median_ms": 0.9, "alone_median_ms": 0.7}
     int8 = {"onnx_bytes": 500_000, "median_ms": 0.4, "ratio_to_yardstick": 0.3, "pose_median_ms": 0.5}
     path.write_text(json.dumps(record | {"int8": int8, "settings": {"precision": "int8"}}))
-    assert load(run.folder).costs == pytest.approx({
+    assert load_measured_run(run.folder).costs == pytest.approx({
         "FLOPs": 0.026, "MACs": 0.013, "parameters": 0.356798, "size": 0.5, "ms": 0.4, "network ms": 0.7,
         "pose ms": 0.5, "ratio": 0.3, "FPS": 2500,
     })  # fmt: skip
     said = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: run).flags
-    assert any("of a file of less precision, errors of float32" in flag for flag in said)
+    assert any("for a file with less precision, errors are for float32" in flag for flag in said)
     path.write_text(json.dumps(record | {"int8": int8}))
-    assert load(run.folder).costs["size"] == 1.9
+    assert load_measured_run(run.folder).costs["size"] == 1.9
     assert not any(
         "less precision" in f for f in table_of(replace(sweep, seeds=(0,)), lambda variant, seed: run).flags
     )
@@ -41,17 +41,19 @@ def test_size_and_times_are_of_the_precision_that_was_asked_for(sweep: Sweep, tm
 
 def test_costs_of_an_earlier_recipe_are_known_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     run, settings = fake_run(tmp_path, "run"), {"graph": "naive", "precision": "int8"}
-    before = load(run.folder).origin.component_versions
+    before = load_measured_run(run.folder).origin.component_versions
     path = run.deployment("fp32-0").latency
     path.write_text(json.dumps(json.loads(path.read_text()) | {"settings": settings}))
     path.parent.rename(path.parent.with_name(hash_deployment_settings(settings)))
-    after = load(run.folder).origin.component_versions
+    after = load_measured_run(run.folder).origin.component_versions
     made_by = {name: number for name, number in after.items() if name not in before}
     assert made_by.keys() == {"export", "latency", "graph.naive", "int8"}
     number = made_by["latency"]
     monkeypatch.setitem(VERSIONS, "latency", number + 1)
     assert list_outdated(made_by) == [f"latency {number} -> {number + 1}"]
-    assert load(run.folder).origin.component_versions == before  # by which numbers it was made, is not known
+    assert (
+        load_measured_run(run.folder).origin.component_versions == before
+    )  # by which numbers it was made, is not known
 
 
 def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
@@ -74,10 +76,10 @@ def test_a_refined_network_saw_its_own_frames_and_the_refiners(tmp_path: Path):
     network = fake_run(tmp_path, "network", config={"optim": optim, "model": {"frames": 7}, "refiner": None})
     config = {"optim": {"steps": 5, "batch": 4}, "model": {"frames": 7}, "refiner": {"frames": 30}}
     refined = fake_run(tmp_path, "refined", config=config, origin={"prerequisite": network.id})
-    seen = [load(run.folder).training.get("frames") for run in (network, refined)]
+    seen = [load_measured_run(run.folder).training.get("frames") for run in (network, refined)]
     assert seen == [140, 140 + 600]
     orphan = fake_run(tmp_path, "orphan", config=config, origin={"prerequisite": "0" * 16})
-    assert "frames" not in load(orphan.folder).training  # what came before is not known
+    assert "frames" not in load_measured_run(orphan.folder).training  # what came before is not known
 
 
 def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):
@@ -96,47 +98,47 @@ def test_the_evaluations_of_a_table_are_its_own(tmp_path: Path):
     report = json.loads(run.evaluation("stream-0").read_text())
     other = {"mode": "stream", "mean": {"combined": {"MPJPE": 1.0}}, "clips": report["clips"]}
     write_report(run.evaluation("stream-1"), other)
-    assert load(run.folder, ["stream-0"]).value("stream", "combined", "MPJPE") != 1.0
-    assert load(run.folder, ["stream-1"]).value("stream", "combined", "MPJPE") == 1.0
-    assert load(run.folder, ["stream-1"]).value("stream", "rotation", "MPJPE") is None
+    assert load_measured_run(run.folder, ["stream-0"]).get_value("stream", "combined", "MPJPE") != 1.0
+    assert load_measured_run(run.folder, ["stream-1"]).get_value("stream", "combined", "MPJPE") == 1.0
+    assert load_measured_run(run.folder, ["stream-1"]).get_value("stream", "rotation", "MPJPE") is None
 
 
 SOURCES = {clip: clip.split("/")[0] for clip in CLIPS}
 
 
-def mixed(outputs) -> Measured:
+def mixed(outputs) -> MeasuredRun:
     run = fake_run(outputs, "a")
     for path in run.evaluations.glob("*.json"):
         report = read_json(path)
         for row in report["clips"]:
             row["source"] = SOURCES[row["name"]]
         write_report(path, {key: value for key, value in report.items() if key != "digest"})
-    return load(run.folder)
+    return load_measured_run(run.folder)
 
 
 def test_means_of_one_sources_clips(tmp_path):
     measured = mixed(tmp_path)
     assert measured.clip_sources == SOURCES
-    found = measured.by_source()
+    found = measured.split_by_source()
     assert list(found) == ["kicks", "salsa"]
     assert list(found["kicks"].clips) == ["kicks/01", "kicks/02"]
     for source, part in found.items():
         own = [clip for clip in CLIPS if SOURCES[clip] == source]
         expected = sum(measured.clips[clip]["stream"]["rotation"]["MPJPE"] for clip in own) / len(own)
-        assert part.value("stream", "rotation", "MPJPE") == pytest.approx(expected)
-    whole = measured.value("stream", "rotation", "MPJPE")
-    assert found["salsa"].value("stream", "rotation", "MPJPE") != whole
+        assert part.get_value("stream", "rotation", "MPJPE") == pytest.approx(expected)
+    whole = measured.get_value("stream", "rotation", "MPJPE")
+    assert found["salsa"].get_value("stream", "rotation", "MPJPE") != whole
 
 
 def test_sources_are_kept(tmp_path):
-    kept = Kept("5", (), {"a": {0: mixed(tmp_path)}}, {"a": ()})
+    kept = KeptResults("5", (), {"a": {0: mixed(tmp_path)}}, {"a": ()})
     path = tmp_path / "kept.json"
-    path.write_text(dumps(kept))
-    again = load_kept(path)
+    path.write_text(format_results(kept))
+    again = load_kept_results(path)
     assert again.sources == ("kicks", "salsa")
-    assert dumps(again) == path.read_text()
-    part = again.runs["a"][0].by_source()["kicks"]
-    whole = kept.runs["a"][0].by_source()["kicks"]
+    assert format_results(again) == path.read_text()
+    part = again.runs["a"][0].split_by_source()["kicks"]
+    whole = kept.runs["a"][0].split_by_source()["kicks"]
     assert math.isclose(
         part.means["stream"]["rotation"]["MPJPE"], whole.means["stream"]["rotation"]["MPJPE"], rel_tol=1e-4
     )

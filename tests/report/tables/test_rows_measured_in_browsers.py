@@ -11,7 +11,7 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep
 from memmlp.report.tables.build_table import make_empty_table
-from memmlp.report.tables.rows_measured_in_browsers import add_rows, read
+from memmlp.report.tables.rows_measured_in_browsers import add_rows, read_bench
 from memmlp.report.tables.table_text import FORMATS
 
 ROW = {
@@ -39,7 +39,7 @@ def written(folder: Path, content: Any) -> Path:
 
 def test_they_stand_below_the_table_s_own_with_device_and_browser(tmp_path: Path):
     table = make_empty_table(find_sweep("17", ()), ("stream",), "nothing measured")
-    shown = add_rows(table, read(written(tmp_path, FILE)))
+    shown = add_rows(table, read_bench(written(tmp_path, FILE)))
     base, ours = shown.rows[len(table.rows) :]
     assert (
         base.label == "AvatarPoser of 4.12 M parameters, as published, fp32, wasm: Quest 9, OculusBrowser 1"
@@ -63,7 +63,7 @@ def test_they_stand_below_the_table_s_own_with_device_and_browser(tmp_path: Path
 def test_rows_of_other_threads_steps_and_backends(tmp_path: Path):
     table = make_empty_table(find_sweep("17", ()), ("stream",), "nothing measured")
     rows = [ROW, OURS | {"threads": 4, "steps": 200, "backend": "webgpu"}]
-    shown = add_rows(table, read(written(tmp_path, FILE | {"rows": rows})))
+    shown = add_rows(table, read_bench(written(tmp_path, FILE | {"rows": rows})))
     assert "1 or 4 threads, the median of 200 or 500 steps" in shown.flags[-1]
     assert shown.rows[-1].against is None  # its backend has no AvatarPoser
     assert shown.rows[-1].cells["stream"]["ms"].effect is None
@@ -75,33 +75,33 @@ WRONG: list[tuple[Any, str]] = [
     (FILE | {"format": "memmlp web bench 2"}, "format"),
     (FILE | {"rows": []}, "rows"),
     (FILE | {"rows": [ROW, 3]}, "rows.json"),
-    (FILE | {"device": ""}, "device: "),
+    (FILE | {"device": ""}, "device="),
     ({k: v for k, v in FILE.items() if k != "browser"}, "browser"),
-    (FILE | {"rows": [ROW | {"median_ms": 0}]}, "median_ms: 0"),
-    (FILE | {"rows": [ROW | {"median_ms": True}]}, "median_ms: True"),
-    (FILE | {"rows": [ROW | {"whole_median_ms": float("nan")}]}, "whole_median_ms: nan"),
-    (FILE | {"rows": [ROW | {"ratio_to_yardstick": "1"}]}, "ratio_to_yardstick: 1"),
+    (FILE | {"rows": [ROW | {"median_ms": 0}]}, "median_ms=0"),
+    (FILE | {"rows": [ROW | {"median_ms": True}]}, "median_ms=True"),
+    (FILE | {"rows": [ROW | {"whole_median_ms": float("nan")}]}, "whole_median_ms=nan"),
+    (FILE | {"rows": [ROW | {"ratio_to_yardstick": "1"}]}, "ratio_to_yardstick=1"),
 ]
 
 
 def test_other_files_are_rejected(tmp_path: Path):
     for content, words in WRONG:
         with pytest.raises(InputError, match="--add") as error:
-            read(written(tmp_path, content))
+            read_bench(written(tmp_path, content))
         assert words in str(error.value), content
     with pytest.raises(InputError, match=r"none\.json: no such file"):
-        read(tmp_path / "none.json")
+        read_bench(tmp_path / "none.json")
     (tmp_path / "rows.json").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"rows\.json"):
-        read(tmp_path / "rows.json")
+        read_bench(tmp_path / "rows.json")
 
 
 def test_words_of_a_file_do_not_reach_a_terminal_as_commands(tmp_path: Path):
-    measured = read(written(tmp_path, FILE | {"device": "evil\x1b[2J\nthing"}))
+    measured = read_bench(written(tmp_path, FILE | {"device": "evil\x1b[2J\nthing"}))
     assert measured.about["device"] == "evil\\x1b[2J\\nthing"
 
 
 def test_other_tables_take_none(tmp_path: Path):
     table = make_empty_table(find_sweep("5", ()), ("stream",), "nothing measured")
-    with pytest.raises(InputError, match=r"--add: .* is not Table 17"):
-        add_rows(table, read(written(tmp_path, FILE)))
+    with pytest.raises(InputError, match=r"--add: must be used with memmlp table 17"):
+        add_rows(table, read_bench(written(tmp_path, FILE)))

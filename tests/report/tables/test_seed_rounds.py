@@ -10,8 +10,8 @@ import pytest
 
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.effects import RunsBySeed
-from memmlp.report.tables.measured_run import Measured, Origin
-from memmlp.report.tables.seed_rounds import Rounds, advance, start_rounds
+from memmlp.report.tables.measured_run import MeasuredRun, Origin
+from memmlp.report.tables.seed_rounds import Rounds, do_next_analysis, start_rounds
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table_text import to_markdown
 from memmlp.sweep.definition import Sweep
@@ -39,7 +39,9 @@ TRUTH = {"full": 0.0, "worse": 2.0, "same": 0.0, "unsure": 0.09}  # the smallest
 Draw = Callable[[str, int, str], np.ndarray]  # (label, seed, "mode metric") -> the error on each clip
 
 
-def run(label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: Mapping[str, str]) -> Measured:
+def run(
+    label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: Mapping[str, str]
+) -> MeasuredRun:
     """Make a finished run with these errors in both modes."""
     modes = ("stream", "window")
     numbers = {mode: {m: draw(label, seed, f"{mode} {m}") for m in metrics} for mode in modes}
@@ -49,7 +51,7 @@ def run(label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: Map
         for i, clip in enumerate(CLIPS[:several])
     }
     means = {mode: {"rotation": {m: float(numbers[mode][m].mean()) for m in metrics}} for mode in modes}
-    return Measured(f"{label} {seed}", means, clips, groups, {}, ORIGIN)
+    return MeasuredRun(f"{label} {seed}", means, clips, groups, {}, ORIGIN)
 
 
 def planted(label: str, seed: int, metric: str) -> np.ndarray:
@@ -64,10 +66,10 @@ class World:
     def __init__(self, sweep: Sweep = SWEEP, draw: Draw = planted, groups: Mapping[str, str] | None = None):
         self.sweep, self.draw, self.groups = sweep, draw, groups or {}
         self.failing: set[tuple[str, int]] = set()
-        self.runs: dict[str, dict[int, Measured]] = {variant.label: {} for variant in sweep.runnable()}
+        self.runs: dict[str, dict[int, MeasuredRun]] = {variant.label: {} for variant in sweep.runnable()}
 
     def spend(self, rounds: Rounds) -> Mapping[str, RunsBySeed]:
-        spent = rounds.spent(self.sweep)
+        spent = rounds.restrict_sweep(self.sweep)
         for variant in spent.runnable():
             for seed in set(spent.seeds_of(variant)) - self.runs[variant.label].keys():
                 if (variant.label, seed) not in self.failing:
@@ -81,14 +83,16 @@ class World:
         return rounds
 
     def look(self, rounds: Rounds) -> Rounds:
-        names = {label: f"{label} {number}" for label, number in rounds.upcoming(self.sweep).items()}
-        return advance(rounds, self.sweep, self.spend(rounds), names)
+        names = {
+            label: f"{label} {number}" for label, number in rounds.find_next_analyses(self.sweep).items()
+        }
+        return do_next_analysis(rounds, self.sweep, self.spend(rounds), names)
 
 
 def verdicts(rounds: Rounds, mode: str = "stream") -> dict[str, tuple[str, int]]:
     return {
         key.label: (str(finding.verdict), look.seeds)
-        for key, (finding, look) in rounds.latest().items()
+        for key, (finding, look) in rounds.find_latest().items()
         if key.mode == mode
     }
 
@@ -98,8 +102,8 @@ def test_the_schedule_is_fixed_at_the_start():
     assert rounds.seeds == (4, 2, 5, 6, 7, 8)  # the sweep's own, then those that follow
     assert rounds.schedule == (3, 5, 6)
     assert sum(rounds.levels) == pytest.approx(0.05)
-    assert rounds.upcoming(SWEEP) == {"worse": 0, "same": 0, "unsure": 0}
-    spent = rounds.spent(SWEEP)
+    assert rounds.find_next_analyses(SWEEP) == {"worse": 0, "same": 0, "unsure": 0}
+    spent = rounds.restrict_sweep(SWEEP)
     assert {variant.label: spent.seeds_of(variant) for variant in spent.runnable()} == dict.fromkeys(
         TRUTH, (4, 2, 5)
     )
@@ -115,15 +119,15 @@ def test_open_variants_and_their_control_alone_go_on():
         "same": ("equivalent", 3),
         "unsure": ("inconclusive", 3),
     }
-    assert rounds.upcoming(SWEEP) == {"unsure": 1}
-    assert rounds.seed_counts(SWEEP) == {"full": 5, "worse": 3, "same": 3, "unsure": 5}
+    assert rounds.find_next_analyses(SWEEP) == {"unsure": 1}
+    assert rounds.count_seeds(SWEEP) == {"full": 5, "worse": 3, "same": 3, "unsure": 5}
     rounds = world.to_the_end(rounds)
     assert [look.seeds for look in rounds.analyses] == [3, 5, 8, 13]
     assert verdicts(rounds)["unsure"] == ("inconclusive", 13)
     assert {label: len(runs) for label, runs in world.runs.items()} == {
         "full": 13, "worse": 3, "same": 3, "unsure": 13
     }  # fmt: skip
-    assert rounds.upcoming(SWEEP) == {}
+    assert rounds.find_next_analyses(SWEEP) == {}
 
 
 def test_what_is_decided_stays_though_later_data_would_reverse_it():
@@ -138,16 +142,16 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
 
     world = World(sweep, draw)
     rounds = world.to_the_end(start_rounds(sweep, 5))
-    assert rounds.seed_counts(sweep) == {"full": 3, "other": 5, "unsure": 5}
+    assert rounds.count_seeds(sweep) == {"full": 3, "other": 5, "unsure": 5}
     assert verdicts(rounds)["other"] == ("higher", 3)
     assert [f.label for f in rounds.analyses[1].findings] == [
         "unsure",
         "unsure",
     ]  # it was not looked at again
-    table = make_table(rounds.spent(sweep), world.runs, rounds=rounds)
+    table = make_table(rounds.restrict_sweep(sweep), world.runs, rounds=rounds)
     cell = next(row for row in table.rows if row.label == "other").cells["stream"]["MPJPE"]
     assert (cell.effect.verdict, cell.effect.decided) == (Verdict.HIGHER, 3)
-    assert cell.effect.significant
+    assert cell.effect.is_significant
 
 
 def test_a_decided_comparison_of_an_open_variant_is_not_looked_at_again():
@@ -181,7 +185,7 @@ def test_one_group_of_clips_ends_it_at_once():
     rounds = world.to_the_end(start_rounds(SWEEP))
     assert len(rounds.analyses) == 1
     assert {verdict for verdict, _ in verdicts(rounds).values()} == {"inconclusive"}
-    assert rounds.upcoming(SWEEP) == {}
+    assert rounds.find_next_analyses(SWEEP) == {}
 
 
 def test_an_variant_whose_runs_failed_is_late_and_others_do_not_wait():
@@ -189,8 +193,10 @@ def test_an_variant_whose_runs_failed_is_late_and_others_do_not_wait():
     world.failing = {("worse", 2)}
     rounds = world.to_the_end(start_rounds(SWEEP, 5))
     assert [sorted(look.runs) for look in rounds.analyses] == [["same", "unsure"], ["unsure"]]
-    assert rounds.upcoming(SWEEP) == {"worse": 0}
-    assert len(rounds.comparisons(SWEEP)) == 6  # its comparisons count although they were not looked at
+    assert rounds.find_next_analyses(SWEEP) == {"worse": 0}
+    assert (
+        len(rounds.list_comparison_keys(SWEEP)) == 6
+    )  # its comparisons count although they were not looked at
     world.failing = set()
     rounds = world.to_the_end(rounds)
     assert verdicts(rounds)["worse"] == ("higher", 3)
@@ -219,7 +225,7 @@ def test_corrections_are_over_all_that_nobody_has_claimed():
 def test_the_table_shows_rounds(tmp_path):
     world = World()
     rounds = world.to_the_end(start_rounds(SWEEP, 5))
-    table = make_table(rounds.spent(SWEEP), world.runs, rounds=rounds)
+    table = make_table(rounds.restrict_sweep(SWEEP), world.runs, rounds=rounds)
     assert {row.label: (len(row.found), len(row.wanted)) for row in table.rows[:4]} == {
         "full": (5, 5), "worse": (3, 3), "same": (3, 3), "unsure": (5, 5)
     }  # fmt: skip
@@ -231,7 +237,7 @@ def test_the_table_shows_rounds(tmp_path):
     assert "missing" not in text
     del world.runs["unsure"][6]
     assert "'unsure' seed 6; fill with" in to_markdown(
-        make_table(rounds.spent(SWEEP), world.runs, rounds=rounds)
+        make_table(rounds.restrict_sweep(SWEEP), world.runs, rounds=rounds)
     )
 
 
@@ -259,7 +265,7 @@ def false_claims(truth: float, noise: float, times: int = 120) -> float:
             return np.full(2, difference)
 
         rounds = World(sweep, draw).to_the_end(start_rounds(sweep))
-        counts.append(any(finding.verdict in false for finding, _ in rounds.latest().values()))
+        counts.append(any(finding.verdict in false for finding, _ in rounds.find_latest().values()))
     return float(np.mean(counts))
 
 

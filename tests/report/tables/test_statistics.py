@@ -17,7 +17,7 @@ from memmlp.report.tables.statistics import (
     correct_by_holm,
     correct_sequentially,
     count_needed_seeds,
-    decide,
+    decide_verdict,
     divide_level,
     estimate_error,
     estimate_paired_effects,
@@ -82,7 +82,7 @@ def test_unequal_groups_weigh_as_their_clips():
 def test_one_seed_or_one_group_has_an_interval_of_the_other_alone(shape, labels, conditional: str):
     d = np.random.default_rng(1).normal(3, 0.1, (2, *shape))
     effects = estimate_paired_effects(d, labels)
-    assert effects.conditional == conditional
+    assert effects.unreplicated == conditional
     assert np.isnan(effects.p).all()
     assert (effects.low < effects.mean).all()
     assert (effects.mean < effects.high).all()
@@ -108,7 +108,9 @@ def test_zero_is_outside_exactly_where_p_is_small(shares: tuple[float, ...]):
     inside = (effects.low < 0) & (effects.high > 0)
     np.testing.assert_array_equal(inside, effects.p > 0.05)
     assert 0.2 < inside.mean() < 0.8
-    np.testing.assert_allclose(estimate_error(d).half(effects.p), np.abs(effects.mean), rtol=1e-6)
+    np.testing.assert_allclose(
+        estimate_error(d).compute_half_width(effects.p), np.abs(effects.mean), rtol=1e-6
+    )
 
 
 def test_equivalence_is_the_interval_within_the_margin():
@@ -203,7 +205,7 @@ def test_noise_is_counted_once():
     # A = B = E, as of noise alone: no wider than the wider of the two sides alone
     known = estimate_error(np.random.default_rng(0).normal(size=(1, 8, 8)))
     known.variances[:] = 1.0
-    assert known.half(0.001)[0] == pytest.approx(stats.t.isf(0.0005, 0.9 * 7**0.6), rel=0.01)
+    assert known.compute_half_width(0.001)[0] == pytest.approx(stats.t.isf(0.0005, 0.9 * 7**0.6), rel=0.01)
 
 
 @pytest.mark.parametrize("count", [2, 10, 40])
@@ -261,9 +263,9 @@ def test_holm_stays_below_one_and_leaves_nan_out():
     ],
 )
 def test_verdicts(difference: float, equivalence: float, mean: float, paper: float | None, expected: Verdict):
-    assert decide(difference, equivalence, mean, paper) is expected
-    assert decide(0.03, 1.0, 1.0, 1.0, level=0.02) is Verdict.INCONCLUSIVE
-    assert decide(0.03, 1.0, 1.0, 1.0, level=0.03) is Verdict.HOLDS
+    assert decide_verdict(difference, equivalence, mean, paper) is expected
+    assert decide_verdict(0.03, 1.0, 1.0, 1.0, level=0.02) is Verdict.INCONCLUSIVE
+    assert decide_verdict(0.03, 1.0, 1.0, 1.0, level=0.03) is Verdict.HOLDS
 
 
 def test_looks_and_what_they_spend():
@@ -301,7 +303,7 @@ def test_needed_seeds_are_the_first_that_suffice():
     assert few is not None
     assert many is not None
     assert 2 <= few < many
-    assert count_needed_seeds(d, 6.0, TABLE, most=many - 1) is None
+    assert count_needed_seeds(d, 6.0, TABLE, max_seeds=many - 1) is None
     measured = compute_detectable(d[None], TABLE)[0]
     assert count_needed_seeds(d, 1.0001 * measured, TABLE) == 4
     assert count_needed_seeds(d, 0.9999 * measured, TABLE) == 5

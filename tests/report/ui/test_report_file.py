@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from memmlp.report.ui.report_file import _shorten, encode_query, round_numbers
+from memmlp.report.ui.report_file import _shorten_run_page, encode_query, round_numbers
 
 
 def clip(name: str, error: Any) -> dict[str, Any]:
@@ -14,7 +14,7 @@ def clip(name: str, error: Any) -> dict[str, Any]:
 
 def test_clips_without_a_number_are_the_worst():
     clips = [clip("good", 3.0), clip("nan", "nan"), clip("bad", 9.0), {"name": "none"}, clip("inf", "inf")]
-    kept = _shorten({"clips": clips, "manifest": {}})["clips"]
+    kept = _shorten_run_page({"clips": clips, "manifest": {}})["clips"]
     assert [one["name"] for one in kept] == ["nan", "inf", "bad", "good", "none"]
 
 

@@ -9,7 +9,7 @@ import pytest
 from report.ui.conftest import run_of, started_run
 
 from memmlp.report.ui import run_index
-from memmlp.report.ui.run_index import RunIndex, read_facts, read_recent
+from memmlp.report.ui.run_index import RunIndex, read_facts, read_recent_entries
 
 
 def test_facts_of_a_finished_run(outputs: Path):
@@ -121,5 +121,5 @@ def test_last_entries_of_a_log_that_is_being_written(tmp_path: Path):
     path = tmp_path / "metrics.jsonl"
     lines = [{"step": step, "phase": "train", "time": step, "values": {"loss": 1}} for step in range(9)]
     path.write_text("\n".join(map(json.dumps, lines)) + '\n{"step": 9, "pha')
-    assert [entry[0] for entry in read_recent(path)] == [4, 5, 6, 7, 8]
-    assert read_recent(tmp_path / "none") == []
+    assert [entry[0] for entry in read_recent_entries(path)] == [4, 5, 6, 7, 8]
+    assert read_recent_entries(tmp_path / "none") == []

@@ -10,7 +10,13 @@ from own_package import registers_kept
 from report.ui.conftest import started_run
 
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
-from memmlp.report.ui.runs import describe_units, differing_keys, outdated_modes, read_curves, thin_out
+from memmlp.report.ui.runs import (
+    describe_units,
+    find_differing_keys,
+    list_outdated_modes,
+    read_curves,
+    thin_out,
+)
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import (
     VERSIONS,
@@ -27,9 +33,9 @@ def of(data: str, **config: Any) -> dict[str, Any]:
 
 def test_one_folder_of_data_has_many_spellings():
     here, there = {"data.root": "data/mine", "seed": 0}, {"data.root": "/x/data/mine", "seed": 1}
-    assert differing_keys([of("d", **here), of("d", **there)]) == ["seed"]
-    assert differing_keys([of("d", **here), of("e", **there)]) == ["data.root", "seed"]
-    assert differing_keys([of("d", **here), of("d", seed=0)]) == []
+    assert find_differing_keys([of("d", **here), of("d", **there)]) == ["seed"]
+    assert find_differing_keys([of("d", **here), of("e", **there)]) == ["data.root", "seed"]
+    assert find_differing_keys([of("d", **here), of("d", seed=0)]) == []
 
 
 def test_units_and_what_is_better_of_known_metrics():
@@ -56,12 +62,12 @@ def test_modes_of_an_earlier_component_version_are_named(tmp_path: Path, monkeyp
         "component_versions": find_evaluation_versions(settings),
     }
     write_report(run.evaluation(hash_evaluation_settings(settings)), {**report, "mean": {}, "clips": []})
-    assert outdated_modes(run) == []
+    assert list_outdated_modes(run) == []
     now = VERSIONS["mode.window"]
     monkeypatch.setitem(VERSIONS, "mode.window", now + 1)
-    assert outdated_modes(run) == [f"window (mode.window {now} -> {now + 1})"]
+    assert list_outdated_modes(run) == [f"window (mode.window {now} -> {now + 1})"]
     run.config_path.write_text("[")
-    assert outdated_modes(run) == []
+    assert list_outdated_modes(run) == []
 
 
 def test_curves_follow_a_log_that_is_being_written(tmp_path: Path):

@@ -37,11 +37,11 @@ def test_a_search_in_a_custom_storage_is_read_again(folder: Path, tmp_path: Path
     plan = folder / "controllers/a.json"
     one.update(1).save(plan)
     assert searches.describe("mine")["counts"] == {"running": 1}
-    before = searches.stamp()
+    before = searches.make_stamp()
     finish(one.update(1))
     one.update(1).save(plan)
     assert searches.describe("mine")["counts"] == {"complete": 1, "running": 1}
-    assert searches.stamp() != before
+    assert searches.make_stamp() != before
 
 
 def test_of_few_trials_it_says_why_there_is_no_importance(folder: Path):

@@ -159,7 +159,7 @@ def test_another_address_needs_the_token(outputs: Path):
 
 
 def test_a_port_that_is_taken_is_one_line(server: RunsServer, outputs: Path):
-    with pytest.raises(InputError, match=f"--port {server.server_port}: .*; expected"):
+    with pytest.raises(InputError, match=f"--port {server.server_port}: .*; must be"):
         RunsServer(Answers(outputs, predict), server.server_port)
     with pytest.raises(InputError, match=r"--host nowhere\.invalid"):
         RunsServer(Answers(outputs, predict), 0, "nowhere.invalid")

@@ -17,7 +17,7 @@ from memmlp.report.tables.build_table import (
     make_state_finder,
     make_table,
 )
-from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.seed_rounds import Rounds, start_rounds
 from memmlp.report.tables.table_text import to_json
 from memmlp.report.ui.run_index import RunIndex
@@ -46,7 +46,9 @@ def test_the_table_is_that_of_the_command(outputs: Path):
     folder = outputs / "sweeps" / "mine"
     sweep, plan = load_sweep_copy(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = json.loads(to_json(make_table(sweep, find_finished_runs(sweep, make_run_finder(plan, load)))))
+    table = json.loads(
+        to_json(make_table(sweep, find_finished_runs(sweep, make_run_finder(plan, load_measured_run))))
+    )
     shown = describe(sweeps_of(outputs))["table"]
     assert shown["rows"] == table["rows"]
     (row,) = [row for row in shown["rows"] if row["label"] == "gru"]
