@@ -28,7 +28,7 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: KeptResults, tmp_p
     assert (read.sweep, read.overrides, read.command) == (
         "table14", ("data=mocap",), "memmlp sweep table14 data=mocap",
     )  # fmt: skip
-    tables = [make_table(sweep, one.runs_of(sweep)) for one in (kept, read)]
+    tables = [make_table(sweep, one.select_runs(sweep)) for one in (kept, read)]
     assert tables[0].flags == tables[1].flags
     for before, after in zip(tables[0].rows, tables[1].rows, strict=True):
         for mode in tables[0].modes:
@@ -50,9 +50,9 @@ def test_a_run_that_diverged_is_kept(sweep: Sweep, kept: KeptResults, tmp_path: 
     run.means["stream"]["combined"]["MPJPE"] = number
     save_results(tmp_path / "kept.json", kept)
     cells = [
-        next(row for row in make_table(sweep, one.runs_of(sweep)).rows if row.label == "2").cells["stream"][
-            "MPJPE"
-        ]
+        next(row for row in make_table(sweep, one.select_runs(sweep)).rows if row.label == "2").cells[
+            "stream"
+        ]["MPJPE"]
         for one in (kept, load_kept_results(tmp_path / "kept.json"))
     ]
     for cell in cells:
@@ -97,7 +97,7 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: KeptResul
         assert (run.id, read.runs[two][seed].costs["ms"]) == (read.runs[two][seed].id, 5.0)
         assert read.runs[three][seed].means != run.means
     assert format_results(read) == (tmp_path / "kept.json").read_text()
-    flags = make_table(replace(sweep, control=one), read.runs_of(sweep)).flags
+    flags = make_table(replace(sweep, control=one), read.select_runs(sweep)).flags
     (said,) = (flag for flag in flags if "are one run" in flag)
     assert said == f"'{two}' and '{one}' are one run: they differ only in deployment and costs"
 
@@ -105,7 +105,7 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: KeptResul
 def test_results_with_further_runs_are_not_replaced(kept: KeptResults):
     fewer = replace(kept, runs={label: {0: runs[0]} for label, runs in kept.runs.items()})
     kept.check_can_replace(fewer)
-    with pytest.raises(InputError, match=r"not here: '2' seed 1, '2' seed 2, '2, 4' seed 1"):
+    with pytest.raises(InputError, match=r"not found: '2' seed 1, '2' seed 2, '2, 4' seed 1"):
         fewer.check_can_replace(kept)
     with pytest.raises(InputError, match="data=synthetic"):
         kept.check_can_replace(replace(kept, overrides=("data=synthetic",)))

@@ -121,14 +121,18 @@ def make_table(
 
 
 def _make_row(
-    sweep: Sweep, variant: Variant, runs: RunsBySeed | None, modes: Sequence[str], found: Mapping[Key, Effect]
+    sweep: Sweep,
+    variant: Variant,
+    runs: RunsBySeed | None,
+    modes: Sequence[str],
+    effects: Mapping[Key, Effect],
 ) -> Row:
 
-    def cell(mode: str, metric: str) -> Cell:
+    def make_cell(mode: str, metric: str) -> Cell:
         counted = select_runs_for_metric(metric, runs or {})
         numbers = {seed: run.get_value(mode, variant.branch, metric) for seed, run in counted.items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}
-        effect = found.get(Key(variant.label, mode, metric))
+        effect = effects.get(Key(variant.label, mode, metric))
         return Cell(
             values, (variant.paper or {}).get(metric), effect, find_paper_effect(sweep, variant, metric)
         )
@@ -144,7 +148,7 @@ def _make_row(
         note=variant.note,
         found=tuple(runs or ()),
         wanted=sweep.seeds_of(variant) if runs is not None else (),
-        cells={mode: {metric: cell(mode, metric) for metric in sweep.metrics} for mode in modes},
+        cells={mode: {metric: make_cell(mode, metric) for metric in sweep.metrics} for mode in modes},
         pairing=pairing,
     )
 

@@ -162,9 +162,11 @@ def join_quoted(labels: Iterable[str]) -> str:
     return join_first([f"'{label}'" for label in drop_repeats(labels)])
 
 
-def join_first(texts: Sequence[str], most: int = 12) -> str:
-    """Join at most `most` texts with commas, followed by the number of omitted texts."""
-    return ", ".join(texts[:most]) + (f", and {len(texts) - most} more" if len(texts) > most else "")
+def join_first(texts: Sequence[str], max_count: int = 12) -> str:
+    """Join at most `max_count` texts with commas, followed by the number of omitted texts."""
+    return ", ".join(texts[:max_count]) + (
+        f", and {len(texts) - max_count} more" if len(texts) > max_count else ""
+    )
 
 
 def describe_core_share(label: str, share: float) -> str:
@@ -241,9 +243,9 @@ def _flag_unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterato
             )
 
 
-def _flag_unequal_groups(every: LabelledRuns) -> Iterator[str]:
+def _flag_unequal_groups(labelled_runs: LabelledRuns) -> Iterator[str]:
     groups: dict[str, set[str]] = defaultdict(set)
-    for _, run in every:
+    for _, run in labelled_runs:
         for clip in run.clips:
             groups[clip].add(run.get_group(clip))
     if several := [clip for clip, names in groups.items() if len(names) > 1]:
@@ -326,11 +328,11 @@ def _flag_smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> I
         yield f"{less}; motion that is smoother than the truth is not better"
 
 
-def _flag_short_training(every: LabelledRuns) -> Iterator[str]:
-    found = [(label, warn_if_hardly_trained(run.training.get("frames", 0.0))) for label, run in every]
+def _flag_short_training(labelled_runs: LabelledRuns) -> Iterator[str]:
+    found = [(label, warn_if_hardly_trained(run.training.get("frames", 0.0))) for label, run in labelled_runs]
     for warning in drop_repeats(warning for _, warning in found if warning):
         labels = drop_repeats(label for label, one in found if one == warning)
-        every_variant = len(labels) == len({label for label, _ in every})
+        every_variant = len(labels) == len({label for label, _ in labelled_runs})
         yield f"{warning}: {'every variant' if every_variant else join_quoted(labels)}"
 
 
@@ -373,33 +375,35 @@ def _flag_busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator
         yield f"times are of the seeds that were timed with a core to themselves: {join_first(fewer)}"
 
 
-def _flag_data_warnings(every: LabelledRuns, field: str, ending: str = "") -> Iterator[str]:
-    for warning in drop_repeats(text for _, run in every if (text := getattr(run.origin, field))):
-        labels = join_quoted(label for label, run in every if getattr(run.origin, field) == warning)
+def _flag_data_warnings(labelled_runs: LabelledRuns, field: str, ending: str = "") -> Iterator[str]:
+    for warning in drop_repeats(text for _, run in labelled_runs if (text := getattr(run.origin, field))):
+        labels = join_quoted(label for label, run in labelled_runs if getattr(run.origin, field) == warning)
         yield f"{warning}{ending}: {labels}"
 
 
-def _flag_unequal_versions(every: LabelledRuns) -> Iterator[str]:
-    versions = [(run.origin.every_version, label) for label, run in every]
+def _flag_unequal_versions(labelled_runs: LabelledRuns) -> Iterator[str]:
+    versions = [(run.origin.every_version, label) for label, run in labelled_runs]
     for name in sorted({name for known, _ in versions for name in known}):
         having = [(str(known[name]), label) for known, label in versions if name in known]
         yield from flag_differences(f"component version of {name}", having)
     weights: dict[str, list[tuple[str, str]]] = defaultdict(list)
-    for label, run in every:
+    for label, run in labelled_runs:
         for prerequisite, digests in run.origin.prerequisite_weights.items():
             weights[prerequisite] += [(digest, label) for digest in digests.split(", ")]
     for prerequisite, having in weights.items():  # trained again, or on another machine
         yield from flag_differences(f"digest of the weights of prerequisite run {prerequisite}", having)
-    for name in sorted({name for _, run in every for name in run.origin.plugins}):
-        having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
+    for name in sorted({name for _, run in labelled_runs for name in run.origin.plugins}):
+        having = [
+            (run.origin.plugins[name], label) for label, run in labelled_runs if name in run.origin.plugins
+        ]
         yield from flag_differences(f"code of {name}", having)
 
 
-def _flag_bodies_and_precision(sweep: Sweep, every: LabelledRuns) -> Iterator[str]:
-    bare = [label for label, run in every if run.origin.body == BUILT_IN_BODY]
+def _flag_bodies_and_precision(sweep: Sweep, labelled_runs: LabelledRuns) -> Iterator[str]:
+    bare = [label for label, run in labelled_runs if run.origin.body == BUILT_IN_BODY]
     if sweep.table in SMPLH_TABLES and bare:
         yield f"on the built-in skeleton; the paper uses SMPL-H bodies (data.body=FILE): {join_quoted(bare)}"
-    less_precise = [label for label, run in every if run.origin.deployed != "fp32"]
+    less_precise = [label for label, run in labelled_runs if run.origin.deployed != "fp32"]
     if less_precise:
         labels = join_quoted(less_precise)
         yield f"size and times are for a file with less precision, errors are for float32: {labels}"

@@ -301,40 +301,42 @@ def _read_costs(latency: Mapping[str, Any]) -> dict[str, float]:
     """
     measured = select_deployed_measurements(latency)
 
-    def of(name: str) -> float:
+    def get_cost(name: str) -> float:
         return float(measured.get(name, np.nan))
 
     costs = {
-        "FLOPs": of("flops") / 1e9,
-        "MACs": of("macs") / 1e9,
-        "parameters": of("parameters") / 1e6,
-        "size": of("onnx_bytes") / 1e6,
-        "ms": of("median_ms"),
-        "network ms": of("alone_median_ms"),
-        "pose ms": of("pose_median_ms"),
-        "ratio": of("ratio_to_yardstick"),
-        "FPS": 1000 / of("median_ms"),
-        **{name: of(key) for name, key in CORE_SHARES.items()},
+        "FLOPs": get_cost("flops") / 1e9,
+        "MACs": get_cost("macs") / 1e9,
+        "parameters": get_cost("parameters") / 1e6,
+        "size": get_cost("onnx_bytes") / 1e6,
+        "ms": get_cost("median_ms"),
+        "network ms": get_cost("alone_median_ms"),
+        "pose ms": get_cost("pose_median_ms"),
+        "ratio": get_cost("ratio_to_yardstick"),
+        "FPS": 1000 / get_cost("median_ms"),
+        **{name: get_cost(key) for name, key in CORE_SHARES.items()},
     }
     return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}
 
 
 def _read_origin(manifest: Mapping[str, Any]) -> Origin:
 
-    def of(key: str) -> str:
+    def get_text(key: str) -> str:
         return str(manifest.get(key) or UNKNOWN)
 
     git = manifest.get("git") or {}
     # If a training was resumed with other code, its first commit is listed too.
     before = [git["before"][:7]] if git.get("before") else []
-    copied: dict[str, Any] = {name: of(name) for name in ("device", "gpu", "threads", "precision", "body")}
+    copied: dict[str, Any] = {
+        name: get_text(name) for name in ("device", "gpu", "threads", "precision", "body")
+    }
     for name in ("prerequisite", "partial", "divided", "resampled", "unusual"):
         copied[name] = manifest.get(name)
     return Origin(
-        code=", ".join([*before, git["commit"][:7]]) if git else f"version {of('version')}",
+        code=", ".join([*before, git["commit"][:7]]) if git else f"version {get_text('version')}",
         changed=bool(git.get("dirty")),
-        data=of("data")[:8],
-        hardware=of("cpu"),
+        data=get_text("data")[:8],
+        hardware=get_text("cpu"),
         processes=str(manifest.get("processes") or 1),
         torch=str((manifest.get("packages") or {}).get("torch") or UNKNOWN),
         component_versions=manifest.get("component_versions") or {},
@@ -388,9 +390,11 @@ def _join_unique(parts: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(word for part in parts for word in part.split(", ")))
 
 
-def _merge_texts(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:
-    words = {name: dict.fromkeys([*([known[name]] if name in known else []), more[name]]) for name in more}
-    return {**known, **{name: ", ".join(each) for name, each in words.items()}}
+def _merge_texts(earlier: Mapping[str, str], later: Mapping[str, str]) -> dict[str, str]:
+    texts = {
+        name: dict.fromkeys([*([earlier[name]] if name in earlier else []), later[name]]) for name in later
+    }
+    return {**earlier, **{name: ", ".join(each) for name, each in texts.items()}}
 
 
 def find_core_share(run: MeasuredRun) -> float | None:

@@ -118,7 +118,7 @@ def _make_row(
     other = base if base is not row else None
     costs, others = _list_costs(row), _list_costs(other) if other else {}
 
-    def cell(metric: str) -> Cell:
+    def make_cell(metric: str) -> Cell:
         value, theirs = costs.get(metric), others.get(metric)
         effect = None if value is None or theirs is None else Effect(value - theirs)
         return Cell({} if value is None else {0: value}, effect=effect)
@@ -130,7 +130,7 @@ def _make_row(
         note=None,
         found=(0,),
         wanted=(0,),
-        cells={mode: {metric: cell(metric) for metric in table.metrics} for mode in table.modes},
+        cells={mode: {metric: make_cell(metric) for metric in table.metrics} for mode in table.modes},
     )
 
 

@@ -268,7 +268,7 @@ def do_next_analysis(
     number = min(ready)
     analysed = {label: digests[label] for label in ready[number]}
     analysis = Analysis(rounds.schedule[number], rounds.levels[number], analysed, ())
-    analysis = replace(analysis, findings=tuple(_find_findings(rounds, sweep, runs, analysis)))
+    analysis = replace(analysis, findings=tuple(_make_findings(rounds, sweep, runs, analysis)))
     return replace(rounds, analyses=(*rounds.analyses, analysis))
 
 
@@ -348,7 +348,7 @@ def _find_pair(sweep: Sweep, label: str) -> tuple[str, str]:
     return next((one.label, other.label) for one, other in _list_comparisons(sweep) if one.label == label)
 
 
-def _find_findings(
+def _make_findings(
     rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], analysis: Analysis
 ) -> list[Finding]:
     seeds = rounds.seeds[: analysis.seeds]

@@ -58,7 +58,7 @@ def test_variants_without_a_sources_clips_are_left_out_and_named(tmp_path: Path)
     assert (list(old_runs), old.variants, flags) == (["one", "both", "more"], sweep.variants, ())
     assert "test clips of old alone" in old.title
     assert all(len(run.clips) == len(clips) // 2 for run in old_runs["both"].values())
-    with pytest.raises(InputError, match=r"--source third: no finished run .* expected new, old"):
+    with pytest.raises(InputError, match=r"--source third: no finished run .* must be new or old"):
         restrict_to_source(sweep, runs, "third")
 
 

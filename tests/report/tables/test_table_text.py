@@ -61,7 +61,7 @@ def test_an_variant_in_which_nothing_would_have_been_found_is_named(sweep: Sweep
 def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeypatch: pytest.MonkeyPatch):
     """With two seeds that differ, MPJREs of 901 degrees would have been found."""
     assert "too few seeds" not in printed(table, 100)
-    monkeypatch.setattr(Table, "detectable", lambda *_: 901.0)
+    monkeypatch.setattr(Table, "find_detectable", lambda *_: 901.0)
     said = " ".join(printed(table, 100).split())
     assert "901" not in said
     assert "MPJRE: too few seeds" in said

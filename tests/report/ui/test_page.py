@@ -242,7 +242,7 @@ def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: Ru
 def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     answers = Answers(home, predict)
     text = write_page(answers, ["mine.yaml"], "Generated today")
-    with pytest.raises(InputError, match=r"other: .* has mine"):
+    with pytest.raises(InputError, match=r"other: must be a sweep in .*: mine"):
         write_page(answers, ["other"], "")
     assert EVIL not in text
     assert not re.search(r"<link[^>]*href=\"(?!data:)|<(script|img)[^>]*src=", text)
