@@ -1,4 +1,4 @@
-"""`memmlp bench latency`: the time of networks' steps and poses on this machine."""
+"""`memmlp bench latency`: time network steps and poses on this machine."""
 
 from __future__ import annotations
 
@@ -15,24 +15,28 @@ if TYPE_CHECKING:
     from memmlp.deploy.latency import RoundTimes
 
 BASE = "avatar_poser"
-"""The network whose times are the unit of all ratios, in the size of its option."""
+"""The reference network of all ratios, with its default size."""
 DEFAULT_MODELS = (
     f"{BASE},agrol_mlp,agrol_mlp@41,agrol_diffusion,mem_mlp,mem_mlp@60,ego_poser,hmd_poser,vae_hmd,rpm,"
     "manikin_s,recurrent_poser"
 )
-LOWER = ("fp16", "int8", "int8_blocks")
-DEPLOYED = ("naive", "streaming", *LOWER)
+LOWER_PRECISIONS = ("fp16", "int8", "int8_blocks")
+DEPLOYED = ("naive", "streaming", *LOWER_PRECISIONS)
 GRAPHS = ("network", *DEPLOYED)
 
 
 @click.group("bench")
 def bench() -> None:
-    """Measure speed on this machine: rates, and ratios within one process."""
+    """Measure speed on this machine."""
 
 
 @bench.command("latency")
-@click.option("--rounds", default=5, show_default=True, type=click.IntRange(5), help="Timed rounds.")
-@click.option("--steps", default=20, show_default=True, type=click.IntRange(2), help="Steps in a round.")
+@click.option(
+    "--rounds", default=5, show_default=True, type=click.IntRange(5), help="Number of timed rounds."
+)
+@click.option(
+    "--steps", default=20, show_default=True, type=click.IntRange(2), help="Number of steps per round."
+)
 @click.option(
     "--models",
     default=DEFAULT_MODELS,
@@ -44,20 +48,21 @@ def bench() -> None:
 @config_dir_option
 @plugins_option
 def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: tuple[str, ...]) -> None:
-    """Time a step of every network.
+    """Time a step of each network.
 
-    All run in ONNX Runtime, in turn in one process, on one thread: the network alone, from features to its
-    own outputs; the deployed steps, which include conversions and forward kinematics; and a whole pose, from
-    a sample of the trackers to the joints. OVERRIDES are those of `memmlp train`; the default is
-    profile=paper. Weights are random, which does not matter for the time. Ratios are of each round's medians:
-    a step's to AvatarPoser's network alone, a pose's to AvatarPoser's pose. The streaming graph is timed
-    where the network has one.
+    All networks run in ONNX Runtime, in turn, in one process with one thread. The command times three things:
+    the bare network; the deployed step, which adds conversions and forward kinematics; and the end-to-end
+    pose, from tracker poses to joints. Streaming graphs are timed for networks that have one.
+
+    OVERRIDES are those of `memmlp train`; the default is profile=paper. Weights are random, which does not
+    affect the times. Ratios compare the medians of each round: steps with AvatarPoser's bare network, and
+    poses with AvatarPoser's pose.
     """
     from memmlp.common.errors import InputError
 
     chosen = [name.strip() for name in models.split(",")]
     if BASE not in chosen:
-        raise InputError(f"--models {models}: must include {BASE}, for the comparison")
+        raise InputError(f"--models {models}: must include {BASE}, the reference of the ratios")
     if named := [word for word in overrides if word.lstrip("+").startswith(("model=", "model.frames="))]:
         raise InputError(f"{named[0]}: set networks and their windows with --models")
     if file and not file.absolute().parent.is_dir():
@@ -76,7 +81,7 @@ def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: 
 def export_all(
     models: list[str], overrides: tuple[str, ...], folder: Path
 ) -> Iterator[tuple[tuple[str, str], Path]]:
-    """Export each model's graphs, with a progress bar, and yield (model, graph) with the file."""
+    """Export each model's graphs, with a progress bar, and yield pairs of (model, graph) and file."""
     import torch
 
     from memmlp.common.progress import progress_bar
@@ -98,13 +103,13 @@ def export_all(
         if has_streaming_graph(model):
             stream = streaming(model)
             export(stream, files["streaming"], "random")
-            for precision in LOWER:
+            for precision in LOWER_PRECISIONS:
                 write_lower_precision(precision, files["streaming"], files[precision], stream, clips)
         yield from (((name, graph), path) for graph, path in files.items() if path.exists())
 
 
 def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
-    """Time all files in turn: their steps, then the whole poses of the deployed ones; see `summarize`."""
+    """Time the steps of all files in turn, then the end-to-end poses of deployed files; see `summarize`."""
     from memmlp.deploy.latency import time_steps_in_rounds
     from memmlp.live.pose_latency import time_poses_in_rounds
 
@@ -124,12 +129,13 @@ def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, flo
 
     Args:
         prefix: the beginning of the keys.
-        times: its times.
-        base: the times of the file with which it is compared.
+        times: the file's times.
+        base: the times of the reference file.
 
     Returns:
-        Median and 95th percentile in milliseconds; the median, minimum and maximum, over the rounds, of the
-        ratio of both medians; and the least share of a round in which the thread had a core.
+        The median and 95th percentile in milliseconds. The ratio of the file's median to the reference's: its
+        median, minimum and maximum over the rounds. The minimum, over the rounds, of the fraction of time in
+        which the thread had a core.
     """
     import numpy as np
 
@@ -145,12 +151,12 @@ def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, flo
 
 
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
-    """Print the rows as a table of 80 columns, one line each."""
+    """Print the rows as a table with one line per row, 80 characters wide."""
     from rich.console import Console
     from rich.table import Table
 
     print(f"milliseconds on one thread, {rounds} rounds in turn; x: ratio to AvatarPoser's network or pose")
-    print("core: the least % of a round in which the thread had a core; below 90, other work is in the times")
+    print("core: minimum % of a round in which the thread had a core; below 90, the times are unreliable")
     table = Table(box=None, pad_edge=False)
     for name in ("network", "graph"):
         table.add_column(name, no_wrap=True)
@@ -162,14 +168,14 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
         table.add_row(
             row["model"],
             row["variant"],
-            *(shorten(row[key]) for key in ("median_ms", "p95_ms", "ratio_to_avatar_poser")),
-            f"{shorten(row['ratio_least'])}-{shorten(row['ratio_most'])}",
-            *("" if value is None else shorten(value) for value in pose),
+            *(shorten_number(row[key]) for key in ("median_ms", "p95_ms", "ratio_to_avatar_poser")),
+            f"{shorten_number(row['ratio_least'])}-{shorten_number(row['ratio_most'])}",
+            *("" if value is None else shorten_number(value) for value in pose),
             f"{100 * core:.0f}",
         )
     Console().print(table)
 
 
-def shorten(number: float) -> str:
+def shorten_number(number: float) -> str:
     """Return a number in at most four characters, so that a row fits a line of 80."""
     return f"{number:.2f}" if number < 10 else f"{number:.1f}" if number < 100 else f"{number:.0f}"

@@ -27,15 +27,15 @@ LABELS = [word for name in NETWORKS for word in ("--label", name)]
 def demo(overrides: tuple[str, ...]) -> None:
     """Run synthetic motion -> VQ-VAE -> Mem-MLP -> metrics -> ONNX -> latency, in minutes, on the CPU.
 
-    RecurrentPoser, this project's own network, follows, and both are shown side by side. OVERRIDES are those
-    of `memmlp train`, for example profile=tiny. With another model, or overrides that RecurrentPoser does not
-    have, only the first network is trained.
+    Then the demo trains RecurrentPoser, this project's own network, and compares both networks. OVERRIDES are
+    those of `memmlp train`, for example profile=tiny. The demo trains only one network if you choose a model,
+    or if RecurrentPoser does not support an override.
     """
     from memmlp.cli.train_summary import show_side_by_side
     from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
 
     started = time.monotonic()
-    both = fits_recurrent_poser(overrides)  # before the minutes of the first network
+    both = is_valid_for_recurrent_poser(overrides)  # checked before the first network trains for minutes
     outcomes = train_demo(overrides) + (train_demo([*overrides, RECURRENT_POSER]) if both else [])
     if len(outcomes) == len(NETWORKS):
         show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
@@ -44,11 +44,11 @@ def demo(overrides: tuple[str, ...]) -> None:
         ):
             click.echo(remark)
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
-    click.echo(next_steps(overrides, inactive_environment(), [one.run.id for one in outcomes]))
+    click.echo(describe_next_steps(overrides, find_inactive_environment(), [one.run.id for one in outcomes]))
 
 
-def fits_recurrent_poser(overrides: Sequence[str]) -> bool:
-    """Return whether a demo's overrides leave the network open, and are valid for RecurrentPoser, too."""
+def is_valid_for_recurrent_poser(overrides: Sequence[str]) -> bool:
+    """Return whether a demo's overrides do not choose a network and are valid for RecurrentPoser, too."""
     from memmlp.common.errors import InputError
     from memmlp.config.compose import parse, preflight
 
@@ -62,7 +62,7 @@ def fits_recurrent_poser(overrides: Sequence[str]) -> bool:
 
 
 def train_demo(overrides: Sequence[str]) -> list[Outcome]:
-    """Finish the run with these overrides, show its results and return them."""
+    """Finish the run with these overrides, then print and return its results."""
     from memmlp.cli.train import run_training, train
 
     outcomes: list[Outcome] = []
@@ -75,18 +75,20 @@ def train_demo(overrides: Sequence[str]) -> list[Outcome]:
     return outcomes
 
 
-def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: Sequence[str] = ()) -> str:
+def describe_next_steps(
+    overrides: Sequence[str], environment: Path | None = None, runs: Sequence[str] = ()
+) -> str:
     """Return the commands to try next, with the demo's settings.
 
     Args:
-        overrides: the demo's overrides, which the same network without its memory needs, too.
+        overrides: the demo's overrides; the run without a memory uses them, too.
         environment: the folder of a virtual environment that this shell has not activated, or None.
-        runs: ids of the demo's runs; two of them are drawn beside the truth.
+        runs: ids of the demo's runs; with two ids, the commands include drawing both networks.
     """
     command = shlex.join(["memmlp", "train", *overrides, "memory=none"])
     kept = [shlex.quote(word) for word in overrides if word.startswith(("profile=", "threads=", "device="))]
     lines = [
-        f"{command}          the same without the memory; then memmlp runs list",
+        f"{command}          the same network without its memory; then memmlp runs list",
         "memmlp data import BVH_FOLDER --out outputs/data/mine",
         " ".join(["memmlp train", *kept, "data=mocap data.root=outputs/data/mine"]),
     ]
@@ -97,8 +99,8 @@ def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: 
     return "next: " + "\n      ".join(lines)
 
 
-def inactive_environment() -> Path | None:
-    """Return the folder of this Python's virtual environment if the shell has not activated it, else None."""
+def find_inactive_environment() -> Path | None:
+    """Return the folder of this Python's virtual environment, or None if the shell has activated it."""
     here = Path(sys.prefix)
     path = shutil.which("memmlp")
     inside = path is not None and Path(path).parent == here / "bin"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import check_runs, device_option, outputs_option, plugins_option
+from memmlp.cli.options import check_runs_exist, device_option, outputs_option, plugins_option
 from memmlp.common.errors import InputError
 
 
@@ -16,15 +16,15 @@ from memmlp.common.errors import InputError
 @click.option(
     "--save-predictions",
     type=click.Path(path_type=Path),
-    help="Folder to write true and predicted motion into, one npz file for each test clip.",
+    help="Folder for the true and predicted motion, with one npz file per test clip.",
 )
 @click.option(
     "--json",
     "json_path",
     type=click.Path(path_type=Path),
-    help="File to write the metrics into, means and one row for each clip, as JSON.",
+    help="JSON file for the metrics: means, and one row per clip.",
 )
-@click.option("--again", is_flag=True, help="Repeat measurements that exist already.")
+@click.option("--again", is_flag=True, help="Repeat existing measurements.")
 @device_option
 @plugins_option
 @outputs_option
@@ -37,19 +37,20 @@ def evaluate(
     device: str,
     outputs: Path,
 ) -> None:
-    """Show the metrics of a finished run (id, its beginning, or folder) on its test clips.
+    """Show the metrics of a finished run on its test clips.
 
-    OVERRIDES are keys of the evaluation or the export, such as evaluation.ik=lbfgs, evaluation.modes=[stream]
-    or export.precision=int8. Missing measurements are made; nothing is trained.
+    RUN is an id, the beginning of an id, or a folder. OVERRIDES are keys of the evaluation or the export,
+    such as evaluation.ik=lbfgs, evaluation.modes=[stream] or export.precision=int8. Missing results are
+    measured without training.
     """
-    check_runs(outputs, run)
+    check_runs_exist(outputs, run)
     if json_path is not None and not json_path.absolute().parent.is_dir():
         raise InputError(f"--json {json_path}: must be a file in an existing folder")
     if save_predictions is not None and save_predictions.exists() and not save_predictions.is_dir():
         raise InputError(f"--save-predictions {save_predictions}: must be a folder, not a file")
     from rich.console import Console
 
-    from memmlp.cli.train_summary import metrics_table, run_warnings, source_tables
+    from memmlp.cli.train_summary import list_run_warnings, make_metrics_table, make_source_tables
     from memmlp.common.files import write_json
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
@@ -62,12 +63,12 @@ def evaluate(
     outcome = f"{' and '.join(made)} done" if made else "measured before"
     click.echo(f"run {found.run.id}: {outcome}")
     facts = [found.run.manifest.get(fact) for fact in ("resampled", "unusual")]
-    for line in (*filter(None, facts), *run_warnings(found.run)):
+    for line in (*filter(None, facts), *list_run_warnings(found.run)):
         click.echo(line)
-    for table in (metrics_table(results), *source_tables(found.run, experiment.stage_ids)):
+    for table in (make_metrics_table(results), *make_source_tables(found.run, experiment.stage_ids)):
         Console(highlight=False).print(table)
     if json_path is not None:
         write_json(json_path, {"mean": results, "clips": read_clip_rows(experiment, found.run)})
     if save_predictions is not None:
         write_predictions(experiment.evaluation, found.network(), found.test, save_predictions)
-        click.echo(f"predictions of {len(found.test.names)} clips under {save_predictions}")
+        click.echo(f"predictions of {len(found.test.names)} clips in {save_predictions}")

@@ -1,4 +1,4 @@
-"""`memmlp export`: the ONNX file of a finished run, checked against torch."""
+"""`memmlp export`: write the ONNX file of a finished run, and check it against torch."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     from memmlp.runs.run import Run
 
 FULL_TOLERANCE = 0.1
-"""Limit in metres and entries of rotation matrices: fp16 changes far less, a broken file far more."""
+"""Maximum deviation in metres or rotation matrix entries. Broken files exceed it, fp16 files do not."""
 
 
-class Form(NamedTuple):
-    """The requested form of a file.
+class ExportForm(NamedTuple):
+    """The requested form of an ONNX file.
 
     Attributes:
         graph: "auto", "streaming" or "naive".
         precision: "fp32", "fp16", "int8" or "int8_blocks".
         opset: the file's ONNX opset.
-        full: the frame of reference and the format of the joints' rotations, for a file that covers
-            everything from trackers to joints; None for the network's step alone.
+        full: the frame of reference and the format of the joints' rotations, for a file that computes joints
+            from tracker poses; None for a file with only the network's step.
     """
 
     graph: str
@@ -44,41 +44,41 @@ class Form(NamedTuple):
     default="auto",
     show_default=True,
     type=click.Choice(["auto", "streaming", "naive"]),
-    help="Graph to export: streaming computes each frame's own share once and keeps it as state, naive is "
-    "the network as it was trained, and auto is streaming where it exists.",
+    help="Graph to export. streaming: computes each frame's features once and keeps them as state; naive: "
+    "the network as trained; auto: streaming if available, otherwise naive.",
 )
 @click.option(
     "--precision",
     default="fp32",
     show_default=True,
     type=click.Choice(["fp32", "fp16", "int8", "int8_blocks"]),
-    help="Precision of the inner layers' weights. A lower one is measured on test clips; int8 is calibrated "
-    "on training clips.",
+    help="Precision of the inner layers' weights. The accuracy of lower precisions is measured on test "
+    "clips. int8 is calibrated on training clips.",
 )
 @click.option(
     "--max-growth",
     type=float,
-    help="Limit of MPJPE's growth in lower precision, percent; no file is written above it.  [default: 1]",
+    help="Maximum increase of MPJPE by lower precision, percent; otherwise no file is written.  [default: 1]",
 )
 @click.option(
     "--opset",
     default=18,
     show_default=True,
     type=click.IntRange(15, 26),
-    help="ONNX operator set of the file; Unity's engine reads up to 15.",
+    help="ONNX operator set of the file; Unity's inference engine supports up to 15.",
 )
 @click.option(
     "--scope",
     default="step",
     show_default=True,
     type=click.Choice(["step", "full"]),
-    help="What the file computes: the network's step, from its 54 inputs, or the whole way from the "
-    "trackers' poses to the joints.",
+    help="Computation in the file. step: the network's step, from its 54 inputs; full: all computations from "
+    "tracker poses to joints.",
 )
 @click.option(
     "--space",
     type=click.Choice(["amass", "openxr", "unity"]),
-    help="Frame of reference of poses, with --scope full.  [default: amass]",
+    help="Frame of reference of the poses, with --scope full.  [default: amass]",
 )
 @click.option(
     "--rotations",
@@ -99,9 +99,10 @@ def export(
     rotations: str | None,
     outputs: Path,
 ) -> None:
-    """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips.
+    """Export a finished run as ONNX, and check the file on whole test clips.
 
-    A file that the run's own export has made and checked already is copied.
+    RUN is an id, the beginning of an id, or a folder. If the run already has a checked file of this form, the
+    command copies it.
     """
     from memmlp.common.errors import InputError
     from memmlp.runs.lookup import find_run
@@ -112,13 +113,13 @@ def export(
         raise InputError(f"--out {out}: there is no folder {out.parent}")
     option = f"--space {space}" if space else f"--rotations {rotations}" if rotations else None
     if scope == "step" and option:
-        raise InputError(f"{option}: needs --scope full; the network's own inputs are in AMASS' world")
+        raise InputError(f"{option}: needs --scope full; the network's inputs are in AMASS' world")
     if precision == "fp32" and max_growth is not None:
         raise InputError(f"--max-growth {max_growth:g}: needs --precision fp16, int8 or int8_blocks")
     if precision.startswith("int8") and scope == "full":
         raise InputError(f"--precision {precision}: needs --scope step")
     full = (space or "amass", rotations or "matrix") if scope == "full" else None
-    form, limit = Form(graph, precision, opset, full), 0.01 if max_growth is None else max_growth / 100
+    form, limit = ExportForm(graph, precision, opset, full), 0.01 if max_growth is None else max_growth / 100
     line = copy_deployed(find_run(outputs, run), out, form, limit)
     if line is None:
         from memmlp.config.open_run import open_run
@@ -130,18 +131,21 @@ def export(
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {line}")
 
 
-def copy_deployed(run: Run, out: Path, form: Form, max_growth: float) -> str | None:
-    """Copy the file of a deployment of the run that has the requested form.
+def copy_deployed(run: Run, out: Path, form: ExportForm, max_growth: float) -> str | None:
+    """Copy the file of the requested form from a deployment of the run.
 
     Returns:
-        A line about its recorded check; None if no deployment has such a file.
+        A line about the file's recorded check; None if no deployment has such a file.
     """
     from memmlp.common.files import atomic_write, file_digest
 
     for folder in sorted(run.deployments.glob("*")):
         deployed = run.deployment(folder.name)
         record, settings, path = deployed.record, deployed.settings, deployed.onnx_path(form.precision)
-        graphs = settings.get("graph", "auto"), record.get("graph")  # as requested then, and as made
+        graphs = (
+            settings.get("graph", "auto"),
+            record.get("graph"),
+        )  # the requested graph, and the exported graph
         if form.full or form.graph not in graphs or form.opset != settings.get("opset", 18):
             continue
         if not (deployed.done and deployed.is_current) or path.name not in record["artifacts"]:
@@ -160,7 +164,7 @@ def copy_deployed(run: Run, out: Path, form: Form, max_growth: float) -> str | N
 
 
 def describe_cost(cost: dict[str, Any], precision: str) -> str:
-    """Describe what lower precision costs in accuracy."""
+    """Describe the loss of accuracy by lower precision."""
     names = ("MPJPE", "position MPJPE", "Jitter")
     changes = {name: f"{cost['fp32'][name]:.2f} -> {cost[precision][name]:.2f}" for name in names}
     if changes["position MPJPE"] == changes["MPJPE"]:  # without a position branch
@@ -168,8 +172,8 @@ def describe_cost(cost: dict[str, Any], precision: str) -> str:
     return ", ".join(f"{name} {change}" for name, change in changes.items())
 
 
-def load(opened: OpenedRun, form: Form) -> tuple[MotionModel, MotionModel | StreamingGraph]:
-    """Return a run's trained network, and the graph of it to export."""
+def load(opened: OpenedRun, form: ExportForm) -> tuple[MotionModel, MotionModel | StreamingGraph]:
+    """Return a run's trained network and its graph to export."""
     from memmlp.deploy.deployment import GRAPHS
     from memmlp.networks.streaming import check_is_stream
 
@@ -178,8 +182,8 @@ def load(opened: OpenedRun, form: Form) -> tuple[MotionModel, MotionModel | Stre
     return model, GRAPHS[form.graph](model)
 
 
-def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, form: Form) -> None:
-    """Write the ONNX file of the network's step, or of the full graph, in float32 and unchecked."""
+def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, form: ExportForm) -> None:
+    """Write the ONNX file of the network's step, or of the full graph, in float32 without a check."""
     from memmlp.deploy.export import export as export_step
     from memmlp.live.trackers_to_body_graph import export_full
 
@@ -189,14 +193,14 @@ def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, 
         export_step(network, path, run_id, form.opset)
 
 
-def write_exact(opened: OpenedRun, out: Path, form: Form) -> str:
-    """Write the float32 ONNX file, provided that it matches the trained network on the longest test clip.
+def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
+    """Write the float32 ONNX file if it matches the trained network on the longest test clip.
 
     Returns:
-        A line about their difference.
+        A line about the difference between file and network.
 
     Raises:
-        ClickException: if file and network differ by more than rounding explains; nothing is written then.
+        ClickException: if file and network differ by more than rounding errors; then nothing is written.
     """
     from memmlp.common.progress import announce
     from memmlp.deploy.parity import TOLERANCE, is_rounding, measure_differences, select_parity_clips
@@ -217,32 +221,32 @@ def write_exact(opened: OpenedRun, out: Path, form: Form) -> str:
         line = f"differs from torch by at most {float(apart.max()):.1e} on a test clip"
         if not is_rounding(apart):
             raise click.ClickException(
-                f"{out}: {line}, more than {TOLERANCE:.0e}: not written; please report it with the run's "
+                f"{out}: not written: {line}, more than {TOLERANCE:.0e}; please report this with the run's "
                 "config.yaml"
             )
         path.replace(out)
     return line
 
 
-def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> str:
-    """Write the ONNX file with lower precision, provided that it is accurate enough.
+def write_lower(opened: OpenedRun, out: Path, form: ExportForm, max_growth: float) -> str:
+    """Write the ONNX file with lower precision if it is accurate enough.
 
-    The cost in accuracy is measured on the network's step, even for a file with the full graph, whose layers
-    are the same. Such a file is also compared with torch on the first test clip.
+    The loss of accuracy is measured for the network's step. A full graph has the same layers, so it is
+    measured in the same way, and also compared with torch on the first test clip.
 
     Args:
         opened: the run.
         out: the file to write.
         form: the requested form.
-        max_growth: the fraction by which MPJPE may grow (0.01 is 1 %).
+        max_growth: the maximum relative increase of MPJPE (0.01 is 1 %).
 
     Returns:
-        A line about the cost.
+        A line about the loss of accuracy.
 
     Raises:
         InputError: for a network without a streaming graph.
-        ClickException: if MPJPE grows by more, or a full graph does not match the network; nothing is written
-            then.
+        ClickException: if MPJPE increases by more, or a full graph does not match the network; then nothing
+            is written.
     """
     from memmlp.common.errors import InputError
     from memmlp.common.progress import announce
@@ -256,7 +260,7 @@ def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> 
         raise InputError(f"--precision {precision}: needs a streaming graph")
     test = opened.data.open("test").clips()
     train = opened.data.open("train").clips() if precision == "int8" else []
-    announce(f"export: write {out} in {precision}, and measure its cost on the test clips")
+    announce(f"export: write {out} in {precision}, and measure its accuracy on the test clips")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         exact, other = Path(folder) / "fp32.onnx", Path(folder) / "other.onnx"
         write_graph(network, exact, opened.run.id, form._replace(full=None))
@@ -264,13 +268,15 @@ def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> 
         cost = compare_accuracy(exact, other, precision, network.normalizer, test)
         line = f"on test clips {describe_cost(cost, precision)}"
         if not cost["growth"] <= max_growth:
-            raise click.ClickException(f"{line}: more than --max-growth {100 * max_growth:g} %, not written")
+            raise click.ClickException(
+                f"{out}: not written: {line}, more than --max-growth {100 * max_growth:g} %"
+            )
         if form.full:
             write_graph(network, exact, opened.run.id, form)
             write_lower_precision(precision, exact, other, network, train)
             apart = float(measure_full_differences(model, other, test[0], form.full[0]).max())
-            line += f"; the full graph differs from torch by at most {apart:.1e} on the first"
+            line += f"; the full graph differs from torch by at most {apart:.1e} on the first test clip"
             if not apart <= FULL_TOLERANCE:
-                raise click.ClickException(f"{line}, more than {FULL_TOLERANCE:g}: not written")
+                raise click.ClickException(f"{out}: not written: {line}, more than {FULL_TOLERANCE:g}")
         other.replace(out)
     return line

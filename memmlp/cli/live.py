@@ -1,4 +1,4 @@
-"""`memmlp live`: a network fed by a clip or by live trackers, watched on a local page."""
+"""`memmlp live`: run a network on a clip or live trackers, with a local web page."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import click
 
 from memmlp.cli.options import (
     PORT,
-    Finite,
-    Program,
-    Sender,
-    check_runs,
+    FiniteFloat,
+    SenderNetwork,
+    TargetAddress,
+    add_page_options,
+    check_runs_exist,
     host_option,
     outputs_option,
-    page_options,
     plugins_option,
     token_option,
 )
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from memmlp.live.stream import Stream
     from memmlp.live.wearer import Calibration
 
-BUILTIN = "own"  # the value of --avatar for the built-in avatar
-SPACE, HZ = "amass", 60.0  # of clips, and the default of packets
+BUILTIN = "own"  # value of --avatar for the built-in avatar
+SPACE, HZ = "amass", 60.0  # for clips, and by default for packets
 
 
 class LiveOptions(NamedTuple):
-    """The command's argument and options."""
+    """The argument and options of `memmlp live`."""
 
     network: str
     outputs: Path
@@ -59,13 +59,13 @@ class LiveOptions(NamedTuple):
     no_browser: bool = True
 
     @property
-    def is_file(self) -> bool:
-        """Whether the network is an ONNX file, not a run."""
+    def is_onnx_file(self) -> bool:
+        """Whether the network is an ONNX file instead of a run."""
         return self.network.endswith(".onnx")
 
     @property
     def packets(self) -> tuple[str, int] | None:
-        """The kind and the port of the packets; None for a clip."""
+        """The kind of packets ("udp" or "osc") and their port; None for a clip."""
         if self.udp is not None:
             return "udp", self.udp
         return None if self.osc is None else ("osc", self.osc)
@@ -77,150 +77,164 @@ class LiveOptions(NamedTuple):
     "--clip",
     help="Clip to play: a test clip's name, or an AMASS npz file.  [default: the run's first test clip]",
 )
-@click.option("--udp", type=PORT, metavar="PORT", help="Take tracker poses as JSON packets at this UDP port.")
-@click.option("--osc", type=PORT, metavar="PORT", help="Take tracker poses as OSC bundles at this UDP port.")
+@click.option(
+    "--udp", type=PORT, metavar="PORT", help="Receive tracker poses as JSON packets at this UDP port."
+)
+@click.option(
+    "--osc", type=PORT, metavar="PORT", help="Receive tracker poses as OSC bundles at this UDP port."
+)
 @click.option(
     "--sender",
     "senders",
-    type=Sender(),
+    type=SenderNetwork(),
     multiple=True,
-    help="Accept packets of this other machine, too; repeatable.  [default: only this machine's]",
+    help="Other machine to accept packets from; repeatable.  [default: only this machine]",
 )
 @click.option(
     "--space",
     default=SPACE,
     show_default=True,
     type=click.Choice(["amass", "openxr", "unity"]),
-    help="Frame of reference of the packets.",
+    help="Frame of reference of the packets' poses.",
 )
 @click.option(
-    "--hz", default=HZ, show_default=True, type=Finite(10, 1000), help="Samples of a clip per second, Hz."
+    "--hz",
+    default=HZ,
+    show_default=True,
+    type=FiniteFloat(10, 1000),
+    help="Sampling rate of a clip, Hz.",
 )
 @click.option(
     "--height",
-    type=Finite(0.5, 2.5),
+    type=FiniteFloat(0.5, 2.5),
     metavar="METRES",
-    help="Body height of the wearer, metres.  [default: that of the network's body]",
+    help="Body height of the user, metres.  [default: the height of the network's body]",
 )
 @click.option(
-    "--floor", type=Finite(-100, 100), metavar="METRES", help="Height of the floor, metres.  [default: 0]"
+    "--floor",
+    type=FiniteFloat(-100, 100),
+    metavar="METRES",
+    help="Height of the floor, metres.  [default: 0]",
 )
 @click.option(
     "--calibration",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="JSON file of the wearer's calibration, to start with and to save changes on the page to.",
+    help="JSON file of the user's calibration. It is read at the start and updated by changes on the page.",
 )
 @click.option(
     "--vmc",
-    type=Program(),
+    type=TargetAddress(),
     multiple=True,
-    help="Send the body's bones there by the VMC protocol; port 39539 by default; repeatable.",
+    help="Program to send the body's bones to, by the VMC protocol; the default port is 39539; repeatable.",
 )
 @click.option(
     "--vrchat",
-    type=Program(),
+    type=TargetAddress(),
     multiple=True,
-    help="Send trackers to VRChat there; port 9000 by default; repeatable.",
+    help="Address of VRChat, to send trackers to; the default port is 9000; repeatable.",
 )
 @click.option(
     "--record",
     type=click.Path(path_type=Path),
     metavar="FILE",
     multiple=True,
-    help="Record to a new file, .npz, .bvh or .glb, which is written at the end; repeatable.",
+    help="New file for a recording (.npz, .bvh or .glb), written at the end; repeatable.",
 )
 @click.option(
     "--avatar",
     is_flag=False,
     flag_value=BUILTIN,
     metavar="[FILE.vrm]",
-    help="Show a VRM avatar on the page: this file, or the built-in one.",
+    help="Show a VRM avatar on the page: FILE.vrm, or the built-in avatar.",
 )
-@page_options(port=8765)
+@add_page_options(port=8765)
 @host_option
 @token_option
 @plugins_option
 @outputs_option
 def live(**options: Any) -> None:
-    """Show a finished run (id, its beginning, or folder) or an ONNX file live, on a page of this machine.
+    """Show a finished run or an ONNX file live, on a local web page.
 
-    Its input is a clip in real time, repeated, or tracker poses that arrive as packets. The body is shown on
-    the page, and sent to other programs and files on request (docs/guides/live.md). Ctrl-C ends it.
+    RUN is an id, the beginning of an id, or a folder. The input is a repeated clip in real time, or tracker
+    poses from network packets. The page shows the body; options also send it to other programs and files
+    (docs/guides/live.md). Ctrl-C stops the command.
     """
-    given = LiveOptions(**options)
-    check_options(given)
-    if not given.is_file:
-        check_runs(given.outputs, given.network)
+    live_options = LiveOptions(**options)
+    check_options(live_options)
+    if not live_options.is_onnx_file:
+        check_runs_exist(live_options.outputs, live_options.network)
     with contextlib.suppress(KeyboardInterrupt):
-        serve(given)
+        serve(live_options)
 
 
-def check_options(given: LiveOptions) -> None:
-    """Raise InputError for options that contradict each other, or need something that is not installed."""
+def check_options(options: LiveOptions) -> None:
+    """Raise InputError for contradictory options, or for options that need a missing package."""
     from memmlp.common.errors import InputError
     from memmlp.common.page_server import check_token
 
-    worn = {
-        "--height": given.height is not None,
-        "--floor": given.floor is not None,
-        "--calibration": given.calibration is not None,
-        "--sender": bool(given.senders),
+    tracker_options = {
+        "--height": options.height is not None,
+        "--floor": options.floor is not None,
+        "--calibration": options.calibration is not None,
+        "--sender": bool(options.senders),
     }
-    sources = [given.udp, given.osc, given.clip]
+    sources = [options.udp, options.osc, options.clip]
     if sum(source is not None for source in sources) > 1:
         raise InputError("--clip, --udp, --osc: expected only one source")
-    if given.packets is None and given.space != SPACE:
-        raise InputError(f"--space {given.space}: must be {SPACE} with a clip; others are for packets")
-    if given.packets and given.hz != HZ:
+    if options.packets is None and options.space != SPACE:
+        raise InputError(f"--space {options.space}: must be {SPACE} with a clip; other spaces need packets")
+    if options.packets and options.hz != HZ:
         raise InputError("--hz: needs a clip; packets arrive at any rate")
-    if given.packets is None and (names := [name for name, used in worn.items() if used]):
-        raise InputError(f"{names[0]}: needs --udp PORT or --osc PORT, the packets of a wearer's devices")
-    osc = {"--osc": given.osc is not None, "--vmc": given.vmc, "--vrchat": given.vrchat}
+    if options.packets is None and (names := [name for name, used in tracker_options.items() if used]):
+        raise InputError(f"{names[0]}: needs --udp PORT or --osc PORT")
+    osc = {"--osc": options.osc is not None, "--vmc": options.vmc, "--vrchat": options.vrchat}
     if (needing := [name for name, used in osc.items() if used]) and find_spec("pythonosc") is None:
         raise InputError(f"{needing[0]}: needs python-osc: pip install 'memmlp[osc]'")
-    check_token(given.host, given.token)
+    check_token(options.host, options.token)
 
 
-def make_source(given: LiveOptions) -> TrackerSource:
-    """Return the source of the poses: packets at a port, or a clip that is played repeatedly."""
+def make_source(options: LiveOptions) -> TrackerSource:
+    """Return the source of the poses: packets at a port, or a repeated clip."""
     from memmlp.live.session.sources import ClipSource, PacketSource, parse_json_packet, parse_osc_packet
 
-    if given.packets is None:
-        return ClipSource(load_clip(given), given.hz)
-    kind, port = given.packets
+    if options.packets is None:
+        return ClipSource(load_tracked_clip(options), options.hz)
+    kind, port = options.packets
     parse = parse_json_packet if kind == "udp" else parse_osc_packet
-    return PacketSource(kind.upper(), port, parse, given.space, given.senders, note)
+    return PacketSource(kind.upper(), port, parse, options.space, options.senders, print_note)
 
 
-def load_clip(given: LiveOptions) -> TrackedClip:
-    """Load the clip of --clip: an AMASS npz on the network's body, or a test clip of the run.
+def load_tracked_clip(options: LiveOptions) -> TrackedClip:
+    """Load the clip of --clip: an AMASS npz file on the network's body, or a test clip of the run.
 
     Raises:
-        InputError: for a test clip if the network is an ONNX file, or for an unknown name.
+        InputError: for an unknown test clip, or for a test clip of an ONNX file.
     """
     from memmlp.common.errors import InputError
     from memmlp.deploy.onnx_stream import check_file
     from memmlp.live.session.sources import TrackedClip, read_npz_frames
     from memmlp.live.stream import ExportedNetwork
 
-    if given.clip is not None and given.clip.endswith(".npz"):
-        body = ExportedNetwork(network_file(given)[0]).body.rest
-        return TrackedClip(Path(given.clip).stem, read_npz_frames(Path(given.clip), body))
-    if given.is_file:
-        check_file(Path(given.network))
-        raise InputError(f"{given.network}: needs --clip FILE.npz, --udp or --osc; a file has no test clips")
+    if options.clip is not None and options.clip.endswith(".npz"):
+        body = ExportedNetwork(find_network_file(options)[0]).body.rest
+        return TrackedClip(Path(options.clip).stem, read_npz_frames(Path(options.clip), body))
+    if options.is_onnx_file:
+        check_file(Path(options.network))
+        raise InputError(
+            f"{options.network}: needs --clip FILE.npz, --udp or --osc, because ONNX files have no test clips"
+        )
     if sys.stderr.isatty():  # it takes seconds
-        note(f"opening run {given.network} and its test clips")
+        print_note(f"opening run {options.network} and its test clips")
     from memmlp.config.open_run import clip_index, open_run
 
-    test = open_run(given.outputs, given.network).test
-    index = 0 if given.clip is None else clip_index(test, given.clip)
+    test = open_run(options.outputs, options.network).test
+    index = 0 if options.clip is None else clip_index(test, options.clip)
     return TrackedClip(test.names[index], test.clip(index).numpy())
 
 
-def serve(given: LiveOptions) -> None:
-    """Play the source through the network to the outputs, and serve the page, until Ctrl-C."""
+def serve(options: LiveOptions) -> None:
+    """Send the source's poses through the network to the outputs and the page, until Ctrl-C."""
     import threading
     import webbrowser
 
@@ -230,82 +244,84 @@ def serve(given: LiveOptions) -> None:
     from memmlp.live.stream import Stream
     from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
 
-    with contextlib.closing(make_source(given)) as source:
-        file, name = network_file(given)
+    with contextlib.closing(make_source(options)) as source:
+        file, name = find_network_file(options)
         stream = Stream(file, space=source.space)
-        calibration = combine_calibration(given, source.space, stream)
+        calibration = combine_calibration(options, source.space, stream)
         stream.fit(calibration.height, calibration.floor)
         stream.offsets = calibration.offsets
-        avatar, vrm = given.avatar, None
+        avatar, vrm = options.avatar, None
         if avatar is not None:
             vrm = page.make_mannequin_vrm(stream.rest) if avatar == BUILTIN else page.read_vrm(Path(avatar))
         files = page.load_page_files(vrm)
-        outputs = make_outputs(given, stream)
-        run = None if given.is_file else find_run(given.outputs, given.network)
+        outputs = make_outputs(options, stream)
+        run = None if options.is_onnx_file else find_run(options.outputs, options.network)
         remark = warn_if_hardly_trained(count_training_frames(run)) if run else ""
         hub = page.Hub(make_greeting(source, name, outputs, remark, avatar is not None))
         fitting = (
-            Fitting(stream, source.space, given.calibration, hub.publish_state) if source.has_wearer else None
+            Fitting(stream, source.space, options.calibration, hub.publish_state)
+            if source.has_wearer
+            else None
         )
         ask = fitting.submit_order if fitting else None
         with (
             finish_uninterrupted(outputs.close),
-            page.LiveServer(hub, given.port, given.host, given.token, files, ask) as server,
+            page.LiveServer(hub, options.port, options.host, options.token, files, ask) as server,
         ):
             if remark:
-                note(f"{name}: {remark}")
+                print_note(f"{name}: {remark}")
             click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
             for output in outputs.outputs:
                 click.echo(f"  to {output.name}")
-            if not given.no_browser:
+            if not options.no_browser:
                 webbrowser.open(server.url)
             stopped = threading.Event()
-            run_loop(stream, source, hub.publish, stopped, outputs, fitting, avatar is not None, note)
+            run_loop(stream, source, hub.publish, stopped, outputs, fitting, avatar is not None, print_note)
 
 
-def network_file(given: LiveOptions) -> tuple[Path, str]:
-    """Return the ONNX file of the network, and its name."""
+def find_network_file(options: LiveOptions) -> tuple[Path, str]:
+    """Return the path of the network's ONNX file, and the network's name."""
     from memmlp.runs.lookup import find_run
 
-    if given.is_file:
-        return Path(given.network), Path(given.network).name
-    run = find_run(given.outputs, given.network)
+    if options.is_onnx_file:
+        return Path(options.network), Path(options.network).name
+    run = find_run(options.outputs, options.network)
     return run.preferred_onnx, f"run {run.id[:8]}"
 
 
-def combine_calibration(given: LiveOptions, space: SpaceName, stream: Stream) -> Calibration:
-    """Return the wearer's calibration, from --calibration's file and the options, which take precedence.
+def combine_calibration(options: LiveOptions, space: SpaceName, stream: Stream) -> Calibration:
+    """Return the user's calibration from the options and the file of --calibration.
 
-    Offsets are left out if they are for another height than that of the options.
+    Options take precedence. Offsets in the file are ignored if the options set another height.
     """
     from memmlp.live.wearer import SAME, Calibration, compute_body_height, read_calibration
 
     body = compute_body_height(stream.network.body)
     saved = Calibration(space)
-    if given.calibration is not None and given.calibration.exists():
-        saved = read_calibration(given.calibration, space, stream.network.body)
-    height = saved.height if given.height is None else given.height
-    floor = saved.floor if given.floor is None else given.floor
+    if options.calibration is not None and options.calibration.exists():
+        saved = read_calibration(options.calibration, space, stream.network.body)
+    height = saved.height if options.height is None else options.height
+    floor = saved.floor if options.floor is None else options.floor
     offsets = saved.offsets
     if offsets is not None and abs((height or body) - (saved.height or body)) > SAME:
         was = saved.height or body
-        note(f"{given.calibration}: its calibration is for a height of {was:.2f} m; calibrate again")
+        print_note(f"{options.calibration}: its calibration is for a height of {was:.2f} m; calibrate again")
         offsets = None
     return Calibration(space, offsets, height, floor)
 
 
-def make_outputs(given: LiveOptions, stream: Stream) -> Outputs:
-    """Return the outputs that the options name."""
+def make_outputs(options: LiveOptions, stream: Stream) -> Outputs:
+    """Return the outputs that the options request."""
     from memmlp.live.outputs import VMC, VMC_PORT, VRCHAT_PORT, Outputs, Receiver, Recorder, VRChat
 
-    found: list[Output] = [VMC(Receiver(host, port or VMC_PORT, "--vmc")) for host, port in given.vmc]
-    found += [VRChat(Receiver(host, port or VRCHAT_PORT, "--vrchat")) for host, port in given.vrchat]
-    if given.record:
+    found: list[Output] = [VMC(Receiver(host, port or VMC_PORT, "--vmc")) for host, port in options.vmc]
+    found += [VRChat(Receiver(host, port or VRCHAT_PORT, "--vrchat")) for host, port in options.vrchat]
+    if options.record:
         network = stream.network
-        found.append(Recorder(given.record, network.body.rest, network.fps, note))
-    return Outputs(found, note)
+        found.append(Recorder(options.record, network.body.rest, network.fps, print_note))
+    return Outputs(found, print_note)
 
 
-def note(line: str) -> None:
-    """Print a remark to stderr."""
+def print_note(line: str) -> None:
+    """Print a line to stderr."""
     click.echo(line, err=True)

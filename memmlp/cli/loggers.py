@@ -1,4 +1,4 @@
-"""`memmlp loggers` and `memmlp mlflow`: run folders shown in MLflow, TensorBoard and W&B."""
+"""`memmlp loggers` and `memmlp mlflow`: show run folders in MLflow, TensorBoard and W&B."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ def loggers() -> None:
     "names",
     multiple=True,
     type=click.Choice(LOGGERS),
-    help="The logger to update; may be repeated.  [default: mlflow]",
+    help="Logger to update; repeatable.  [default: mlflow]",
 )
 @click.option(
     "--uri",
     default=None,
-    help="Address of MLflow's store.  [default: MLFLOW_TRACKING_URI, or else sqlite in OUTPUTS]",
+    help="Address of MLflow's store.  [default: MLFLOW_TRACKING_URI if set, or SQLite in --outputs]",
 )
-@click.option("--project", default="memmlp", show_default=True, help="W&B's project.")
-@click.option("--full", is_flag=True, help="Show runs again that are up to date.")
+@click.option("--project", default="memmlp", show_default=True, help="W&B project.")
+@click.option("--full", is_flag=True, help="Also update runs that are up to date.")
 @outputs_option
 def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outputs: Path) -> None:
     """Update loggers with all runs.
 
-    Afterwards they have exactly what the run folders have, each thing once. Runs in progress are left to the
-    process that works on them. The command may be repeated at any time.
+    Afterwards the loggers match the run folders, without duplicates. Runs in progress are skipped, because
+    their own processes update the loggers. You can repeat the command at any time.
     """
     from memmlp.common.progress import progress_bar
     from memmlp.runs.loggers import logger as run_loggers
@@ -53,10 +53,10 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
 
     started = [run for run in list_runs(outputs) if run.manifest]
     warnings: list[str] = []
-    for logger in _loggers(names or ("mlflow",), uri, project, outputs):
+    for logger in _make_loggers(names or ("mlflow",), uri, project, outputs):
         counts = run_loggers.sync_runs(logger, progress_bar(started, logger.name), warnings.append, full)
         live = f", {counts['live']} are in progress" if counts["live"] else ""
-        runs = f"{counts['shown'] + counts['same']} runs ({counts['shown']} of them now)"
+        runs = f"{counts['shown'] + counts['same']} runs ({counts['shown']} updated now)"
         click.echo(f"{runs} are in {logger.place}{live}")
     for line in warnings:
         click.echo(f"memmlp: warning: {line}", err=True)
@@ -64,8 +64,8 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
         raise SystemExit(1)
 
 
-def _loggers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[RunLogger]:
-    """Return the loggers with these names. Raises InputError if a package is missing."""
+def _make_loggers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[RunLogger]:
+    """Return the named loggers. Raises InputError if a package is missing."""
     from memmlp.runs.loggers.mlflow import MLflow
     from memmlp.runs.loggers.tensorboard import TensorBoard
     from memmlp.runs.loggers.wandb import WandB

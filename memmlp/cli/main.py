@@ -21,7 +21,7 @@ from memmlp.common.progress import send_announcements_to
 
 
 class Command(NamedTuple):
-    """The place of a sub-command's implementation, its line in the help, and whether it can be resumed."""
+    """A sub-command: the place of its implementation, its help line, and whether it can be resumed."""
 
     module: str
     attribute: str
@@ -30,24 +30,24 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command("demo", "demo", "The whole pipeline on synthetic data, in minutes.", True),
+    "demo": Command("demo", "demo", "Run the whole pipeline on synthetic data, in minutes.", True),
     "train": Command("train", "command", "Train, evaluate, export and time one configuration (Hydra).", True),
     "data": Command("data", "data", "Make, import, prepare, inspect and export motion data."),
-    "sweep": Command("sweep", "sweep", "Run the missing runs of a table or of your own sweep.", True),
-    "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation.", True),
-    "table": Command("table", "table", "The paper's tables beside measured numbers."),
-    "results": Command("results", "results", "Keep runs' results with the code; make pages of them."),
-    "report": Command("report", "report", "The page of `memmlp ui` as one HTML file."),
+    "sweep": Command("sweep", "sweep", "Run the missing runs of a table or of your is_process sweep.", True),
+    "tune": Command("tune", "tune", "Search loss weights, or other keys, by the validation errors.", True),
+    "table": Command("table", "table", "Show the paper's tables beside measured numbers."),
+    "results": Command("results", "results", "Keep results of runs with the code; make pages from them."),
+    "report": Command("report", "report", "Write the page of `memmlp ui` as one HTML file."),
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
     "loggers": Command("loggers", "loggers", "Add runs to MLflow, TensorBoard or W&B."),
-    "mlflow": Command("loggers", "mlflow", "MLflow's page of the runs."),
-    "ui": Command("ui", "ui", "Runs, sweeps and searches on a page of this machine, live."),
-    "eval": Command("evaluate", "evaluate", "Metrics and predictions of a finished run."),
-    "predict": Command("predict", "predict", "A network's predictions for clips, as BVH, glTF or npz."),
-    "render": Command("render", "render", "Figures and films of runs beside the truth, coloured by error."),
-    "live": Command("live", "live", "A network live on a local page, fed by a clip or by trackers."),
-    "web": Command("web", "web", "A site that times and plays networks in any browser, and on a headset."),
-    "export": Command("export", "export", "ONNX file of a finished run."),
+    "mlflow": Command("loggers", "mlflow", "Open MLflow's page of the runs."),
+    "ui": Command("ui", "ui", "Show runs, sweeps and searches on a local web page, live."),
+    "eval": Command("evaluate", "evaluate", "Show metrics and write predictions of a finished run."),
+    "predict": Command("predict", "predict", "Write a network's predictions for clips as BVH, glTF or npz."),
+    "render": Command("render", "render", "Draw runs beside the ground truth as figures or films."),
+    "live": Command("live", "live", "Show a network live on a local page, driven by a clip or trackers."),
+    "web": Command("web", "web", "Make a site that times and plays networks in any browser."),
+    "export": Command("export", "export", "Write the ONNX file of a finished run."),
     "bench": Command("bench", "bench", "Measure speed on this machine."),
 }
 
@@ -55,7 +55,7 @@ COMMANDS = {
 INTERRUPTED = 130  # exit code after a Ctrl-C
 
 
-class Commands(click.Group):
+class CommandGroup(click.Group):
     """A group of commands that imports each command only when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -76,79 +76,80 @@ class Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that the first argument names. Raises InputError, with a hint, if none fits."""
+        """Find the command for the first argument. Raises InputError, with a hint, for an unknown command."""
         if args[0] not in COMMANDS:
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {near[0]}? " if near else ""
-            raise InputError(f"{args[0]}: no such command; {hint}use one of {', '.join(COMMANDS)}")
+            raise InputError(f"{args[0]}: unknown command; {hint}use one of {', '.join(COMMANDS)}")
         return super().resolve_command(ctx, args)
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(memmlp.__version__, prog_name="memmlp")
 def commands() -> None:
-    """Mem-MLP: full-body motion from head and hands, and the platform for its ablations.
+    """Mem-MLP: full-body motion from head and hands, and a platform for experiments with it.
 
-    Works in the current directory: runs and caches lie in outputs/ (or MEMMLP_OUTPUTS).
+    Runs and caches are stored in outputs/ in the current directory, or in MEMMLP_OUTPUTS.
     """
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 after an interruption.
 
-    If this is the whole process (no `argv`), it treats SIGTERM, a scheduler's request to end, like Ctrl-C.
-
-    With MEMMLP_TRACEBACK=1 in the environment the error is raised, which shows where it came from.
+    Without `argv`, the command is the whole process. Then SIGTERM, a scheduler's request to end, acts like
+    Ctrl-C. With MEMMLP_TRACEBACK=1 in the environment, errors are raised with their traceback.
     """
-    own = argv is None
-    if own:
+    is_process = argv is None
+    if is_process:
         collect_garbage_rarely()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        with treat_termination_as_interrupt() if own else nullcontext():
-            _run(arguments)
+        with treat_termination_as_interrupt() if is_process else nullcontext():
+            _run_command_line(arguments)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         sys.exit(2)
     except Exception as error:
-        code = _exit_code(error)
+        code = _choose_exit_code(error)
         if code is None or os.environ.get("MEMMLP_TRACEBACK") == "1":
             raise
-        line = _line(error if code != INTERRUPTED else click.Abort(), arguments)
+        line = _format_error(error if code != INTERRUPTED else click.Abort(), arguments)
         print(f"memmlp: {' '.join(line.split())}", file=sys.stderr)
         sys.exit(code)
 
 
-def _run(arguments: list[str]) -> None:
+def _run_command_line(arguments: list[str]) -> None:
     if distributed.world_size() > 1 and arguments[:1] != ["train"]:
         raise InputError("torchrun: only memmlp train can use several processes")
     if arguments[:1] in (["-sc"], ["--shell-completion"]):
-        _complete(arguments)
+        _print_completions(arguments)
     else:
         with send_announcements_to():
             commands.main(arguments, prog_name="memmlp", standalone_mode=False)
 
 
-def _exit_code(error: Exception) -> int | None:
-    """Return the exit code for an error that one line explains; None for a bug, which needs its traceback."""
-    if isinstance(error, click.Abort):  # what click makes of Ctrl-C
+def _choose_exit_code(error: Exception) -> int | None:
+    """Return the exit code for an expected error; None for a bug, which needs its traceback."""
+    if isinstance(error, click.Abort):  # click raises it for Ctrl-C
         return INTERRUPTED
     if isinstance(error, click.ClickException):
         return error.exit_code
     if isinstance(error, OSError) and error.strerror:
-        return 2 if error.filename else 1  # about a path that the user gave, or its disk
+        return 2 if error.filename else 1  # 2 for a path from the user, 1 for a full or failing disk
     if type(error) in (InputError, TrainingDiverged, LeaseLost):
         return 2 if type(error) is InputError else 1
-    cause: BaseException | None = error  # an error after a Ctrl-C, such as one that cut an import short
+    cause: BaseException | None = error  # may follow from a Ctrl-C, for example during an import
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__
     return None if cause is None else INTERRUPTED
 
 
-def _line(error: Exception, arguments: Sequence[str]) -> str:
+def _format_error(error: Exception, arguments: Sequence[str]) -> str:
     if isinstance(error, click.Abort):
         command = COMMANDS.get(arguments[0]) if arguments else None
-        resumed = "; the same command goes on from the last checkpoint" if command and command.resumes else ""
+        resumed = (
+            "; repeat the command to continue from the last checkpoint" if command and command.resumes else ""
+        )
         return f"interrupted{resumed}"
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "memmlp"
@@ -159,11 +160,10 @@ def _line(error: Exception, arguments: Sequence[str]) -> str:
     return error.format_message() if isinstance(error, click.ClickException) else str(error)
 
 
-def _complete(arguments: list[str]) -> None:
-    """Answer a shell that asks for completions.
+def _print_completions(arguments: list[str]) -> None:
+    """Print shell completions: command names, or Hydra's completions after `memmlp train`.
 
-    `memmlp train -sc install=bash` prints a script that calls `memmlp -sc query=bash` at every tab. This
-    function completes the names of commands; after `memmlp train`, Hydra completes.
+    `memmlp train -sc install=bash` prints a script that calls `memmlp -sc query=bash` at every tab.
     """
     words = os.environ.get("COMP_LINE", "").split(" ")
     if len(words) <= 2:

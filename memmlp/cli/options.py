@@ -18,24 +18,24 @@ PORT = click.IntRange(1, 65535)
 PATH = click.Path(path_type=Path)
 
 
-class Finite(click.FloatRange):
+class FiniteFloat(click.FloatRange):
     """A number in a range, without NaN and infinity."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number; refuse NaN and infinity, which click would accept."""
+        """Return the number; reject NaN and infinity, which click would accept."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} must be a finite number", param, ctx)
         return number
 
 
-class Device(click.ParamType):
-    """The name of a device, in the form of the key `device`."""
+class DeviceName(click.ParamType):
+    """A device name with the syntax of the key `device`."""
 
     name = "auto|cpu|cuda|cuda:INDEX|mps"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the name; whether the device exists is checked when it is used."""
+        """Return the name. Whether the device exists is checked only on use."""
         from memmlp.common.settings import DEVICE
 
         if not DEVICE.allows(value):
@@ -46,19 +46,19 @@ class Device(click.ParamType):
 device_option = click.option(
     "--device",
     default="auto",
-    type=Device(),
+    type=DeviceName(),
     show_default=True,
-    help="Device to compute on; auto takes a GPU of CUDA where there is one.",
+    help="Device to compute on; auto selects a CUDA GPU if available.",
 )
 
 
-class Program(click.ParamType):
-    """The address at which another program takes datagrams: HOST, or HOST:PORT."""
+class TargetAddress(click.ParamType):
+    """The address of a program that receives datagrams: HOST, or HOST:PORT."""
 
     name = "HOST[:PORT]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return host and port; the port is None if it was not given."""
+        """Return host and port. The port is None for HOST."""
         if isinstance(value, tuple):
             return value
         host, colon, port = value.rpartition(":")
@@ -69,7 +69,7 @@ class Program(click.ParamType):
         return host.strip("[]"), PORT.convert(port, param, ctx)
 
 
-class Sender(click.ParamType):
+class SenderNetwork(click.ParamType):
     """An IPv4 address, or a network of addresses such as 192.168.1.0/24."""
 
     name = "ADDRESS"
@@ -88,26 +88,26 @@ outputs_option = click.option(
     default=Path("outputs"),
     envvar="MEMMLP_OUTPUTS",
     show_default=True,
-    help="Folder in which runs and caches of data are kept.",
+    help="Folder of the runs and data caches.",
 )
 source_option = click.option(
-    "--source", help="Source whose test clips are shown, where the data has several.  [default: all together]"
+    "--source", help="Show only the test clips of this data source.  [default: all sources together]"
 )
 
 together_option = click.option(
     "--together",
     multiple=True,
     metavar="PATTERN",
-    help="Count test clips whose names match PATTERN alike as one group in intervals and verdicts.",
+    help="Count test clips as one group if PATTERN matches the same text in their names; repeatable.",
 )
 
 
-def page_options(port: int) -> Callable[[Command], Command]:
-    """Give a command that serves a page the options --port, by default `port`, and --no-browser."""
-    limits, help_text = click.IntRange(0, 65535), "Port of the page; 0 takes a free one."
+def add_page_options(port: int) -> Callable[[Command], Command]:
+    """Add the options --port, with the default `port`, and --no-browser to a command that serves a page."""
+    limits, help_text = click.IntRange(0, 65535), "Port of the page; 0 selects a free port."
     number = click.option("--port", default=port, show_default=True, type=limits, help=help_text)
     browser = click.option(
-        "--no-browser", is_flag=True, help="Print the page's address, and open no browser."
+        "--no-browser", is_flag=True, help="Print the page's address without opening a browser."
     )
     return lambda command: number(browser(command))
 
@@ -116,21 +116,22 @@ host_option = click.option(
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Address to serve at. At another one than this machine's own, every request needs the token.",
+    help="Address to serve at. At addresses other than localhost, every request needs the token.",
 )
 token_option = click.option(
-    "--token", help="The token at another address.  [default: a new one, which is printed]"
+    "--token",
+    help="Access token for a --host other than localhost.  [default: a new token, which is printed]",
 )
 
 
-def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
+def _activate_plugins(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
     from memmlp.config.plugins import activate, split_names
 
     if not ctx.resilient_parsing:
         activate(split_names(value or ""))
 
 
-def _search(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
+def _add_config_folder(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
     from memmlp.config.plugins import search_folder
 
     if not ctx.resilient_parsing:
@@ -140,43 +141,46 @@ def _search(ctx: click.Context, param: click.Parameter, value: Path | None) -> N
 plugins_option = click.option(
     "--plugins",
     metavar="NAMES",
-    callback=_use,
+    callback=_activate_plugins,
     expose_value=False,
-    help="Packages with components of your own, commas between; also MEMMLP_PLUGINS. Their code is run.",
+    help="Comma-separated packages with your own components; also MEMMLP_PLUGINS. Their code is run.",
 )
 
 config_dir_option = click.option(
     "--config-dir",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
-    callback=_search,
+    callback=_add_config_folder,
     expose_value=False,
-    help="Folder of your own configs, searched beside memmlp's; it may name classes of yours.",
+    help="Folder of additional configs; they can refer to your own classes.",
 )
 
 format_option = click.option(
     "--format",
     "format_",
     type=click.Choice(["bvh", "npz", "gltf"]),
-    help="Of the files.  [default: by the suffix .bvh, .npz or .glb of --out]",
+    help="Format of the files.  [default: from the suffix .bvh, .npz or .glb of --out]",
 )
 body_option = click.option(
-    "--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz."
+    "--body",
+    default="builtin",
+    show_default=True,
+    help="Body to use: builtin, or the path of an SMPL-H model.npz.",
 )
 strict_option = click.option(
     "--strict", is_flag=True, help="Stop at the first bad file instead of skipping it."
 )
 
 
-def check_runs(outputs: Path, *names: str) -> None:
-    """Raise InputError for an unknown run, before the imports of what opens runs take their seconds."""
+def check_runs_exist(outputs: Path, *names: str) -> None:
+    """Raise InputError for an unknown run, before slow imports."""
     from memmlp.runs.lookup import find_run
 
     for name in names:
         find_run(outputs, name)
 
 
-def remark_on(*runs: Run) -> None:
-    """Print on standard error which of the runs' networks hardly saw motion in training."""
+def warn_about_training(*runs: Run) -> None:
+    """Warn on standard error about runs with too little training."""
     from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
 
     for run in runs:

@@ -9,13 +9,13 @@ import click
 
 from memmlp.cli.options import (
     PATH,
-    check_runs,
+    check_runs_exist,
     device_option,
     format_option,
     outputs_option,
     plugins_option,
-    remark_on,
     strict_option,
+    warn_about_training,
 )
 
 if TYPE_CHECKING:
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 @click.command("predict")
 @click.argument("run")
 @click.argument("source")
-@click.option("--out", required=True, type=PATH, help="File to write; a folder for a folder.")
+@click.option("--out", required=True, type=PATH, help="File to write, or folder if SOURCE is a folder.")
 @format_option
 @click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
 @click.option(
     "--ik",
     type=click.Choice(["off", "lbfgs", "arms"]),
-    help="Inverse kinematics.  [default: as in the evaluation]",
+    help="Inverse kinematics to apply.  [default: the run's evaluation.ik]",
 )
 @click.option(
     "--branch", type=click.Choice(["rotation", "combined", "truth"]),
-    help="The rotation branch, its rotations after inverse kinematics, or the clip itself.  "
-    "[default: combined with inverse kinematics, else rotation]",
+    help="Motion to write: the rotation branch, its rotations after inverse kinematics (combined), or the "
+    "true clip.  [default: combined with inverse kinematics, otherwise rotation]",
 )  # fmt: skip
 @strict_option
 @device_option
@@ -57,12 +57,12 @@ def predict(
     device: str,
     outputs: Path,
 ) -> None:
-    """Write the predictions of a finished RUN (id, its beginning, or folder) for clips.
+    """Write the predictions of a finished RUN (id, beginning of an id, or folder) for clips.
 
-    SOURCE is an AMASS npz file, a folder of such files, or a test clip's name. Predictions are at 60 Hz on
-    the body that the network was trained on; their first frame is the clip's second.
+    SOURCE is an AMASS npz file, a folder of npz files, or the name of a test clip. Predictions are at 60 Hz
+    on the body of the training. They start at the clip's second frame.
     """
-    check_runs(outputs, run)
+    check_runs_exist(outputs, run)
     from memmlp.cli.data.printing import show_exported
     from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
     from memmlp.evaluation.predictions import ClipPredictor
@@ -86,11 +86,11 @@ def predict(
         report = predict_test_clip(predictor, opened, source, out, format_)
     click.echo(f"run {found.id}: {chosen}, {mode} mode")
     show_exported(report, out)
-    remark_on(found)
+    warn_about_training(found)
 
 
 def choose_branch(evaluation: Evaluation, branch: str | None) -> str:
-    """Return the branch of --branch, else the evaluation's best one: combined where it solves kinematics.
+    """Return the branch of --branch; by default, combined with inverse kinematics, otherwise rotation.
 
     Raises:
         InputError: for --branch combined without inverse kinematics.
@@ -110,7 +110,7 @@ def predict_test_clip(
     """Write the network's prediction for a test clip.
 
     Raises:
-        InputError: if there is no such clip, or `out` is not a file of that format or can't be written.
+        InputError: if the clip does not exist, or `out` has another format or cannot be written.
     """
     from memmlp.common.errors import InputError
     from memmlp.motion.body import FPS

@@ -1,4 +1,4 @@
-"""`memmlp render`: predictions of runs beside the truth, coloured by error, as a figure or a film."""
+"""`memmlp render`: draw predictions of runs beside the ground truth, coloured by error."""
 
 from __future__ import annotations
 
@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import Finite, check_runs, outputs_option, plugins_option, remark_on
+from memmlp.cli.options import (
+    FiniteFloat,
+    check_runs_exist,
+    outputs_option,
+    plugins_option,
+    warn_about_training,
+)
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -18,7 +24,7 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
 
 @click.command("render")
 @click.argument("runs", nargs=-1, required=True)
-@click.option("--clip", help="Name of the test clip to draw.  [default: the first one]")
+@click.option("--clip", help="Name of the test clip to draw.  [default: the first test clip]")
 @click.option(
     "--out",
     required=True,
@@ -26,24 +32,32 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
     help="File to write: a figure (.png) or a film (.gif, .mp4).",
 )
 @click.option(
-    "--label", "labels", multiple=True, help="Label of a run, once for each, in order.  [default: its id]"
+    "--label",
+    "labels",
+    multiple=True,
+    help="Label of a run; repeat the option for each run, in the order of RUNS.  [default: run ids]",
 )
 @click.option(
     "--branch",
     default="rotation",
     show_default=True,
     type=click.Choice(["rotation", "position"]),
-    help="Branch to draw: rotation, by forward kinematics with the head on its tracker, or position, as the "
-    "network gives them.",
+    help="Branch to draw: rotation (forward kinematics with the head at its tracker), or position (the "
+    "network's predicted positions).",
 )
 @click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
 @click.option(
-    "--from", "begin", default=0.0, show_default=True, type=Finite(min=0), help="Start of the piece, seconds."
+    "--from",
+    "begin",
+    default=0.0,
+    show_default=True,
+    type=FiniteFloat(min=0),
+    help="Start of the piece, seconds.",
 )
 @click.option(
     "--to",
     "end",
-    type=Finite(min=0, min_open=True),
+    type=FiniteFloat(min=0, min_open=True),
     help="End of the piece, seconds.  [default: the clip's end]",
 )
 @click.option(
@@ -67,12 +81,12 @@ def render(
     poses: int,
     outputs: Path,
 ) -> None:
-    """Draw the truth and finished RUNS (ids, their beginnings, or folders) on a test clip, coloured by error.
+    """Draw predictions of finished RUNS beside the ground truth of a test clip, coloured by error.
 
-    A PNG has a row for each run and a column for each pose. A GIF or MP4 shows them side by side at 30
-    pictures a second. All share one colour scale.
+    RUNS are ids, beginnings of ids, or folders. A PNG has a row for each run and a column for each pose. A
+    GIF or MP4 shows the runs side by side at 30 frames per second. All runs share one colour scale.
     """
-    check_runs(outputs, *runs)
+    check_runs_exist(outputs, *runs)
     from memmlp.common.errors import InputError
     from memmlp.common.progress import announce
     from memmlp.config.open_run import open_run
@@ -80,7 +94,9 @@ def render(
 
     check_picture_path(out, "--out")
     if labels and len(labels) != len(runs):
-        raise InputError(f"--label: {len(labels)} for {len(runs)} runs; give one for each run, or no label")
+        raise InputError(
+            f"--label: {len(labels)} labels for {len(runs)} runs; give one label for each run, or none"
+        )
     opened = [open_run(outputs, run) for run in runs]
     names = labels or tuple(run.run.id[:8] for run in opened)
     if len(set(names)) < len(names):
@@ -90,16 +106,16 @@ def render(
     write_picture(out, piece, poses, "--out")
     errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in piece.errors.items())
     click.echo(f"{out}: {piece.title}, {errors}")
-    remark_on(*(one.run for one in opened))
+    warn_about_training(*(one.run for one in opened))
 
 
 def _predict_piece(
     runs: dict[str, OpenedRun], clip: str | None, begin: float, end: float | None, branch: str, mode: str
 ) -> ClipPiece:
-    """Return a clip's piece between two times, seconds, with the predictions of runs by their labels.
+    """Return a clip between two times in seconds, with the runs' predictions by label.
 
     Raises:
-        InputError: if the piece is empty, or the runs have different truths for the clip.
+        InputError: if the piece is empty, or the runs' ground truths for the clip differ.
     """
     import numpy as np
 
@@ -122,5 +138,5 @@ def _predict_piece(
         truths.append(arrays["true_positions"][first:last])
         predictions[label] = arrays[POSITIONS[branch]][first:last]
         if not np.array_equal(truths[-1], truths[0]):
-            raise InputError(f"run {run.run.id}: {title} has another motion or body than in the first run")
+            raise InputError(f"run {run.run.id}: the motion or body of {title} differs from the first run")
     return ClipPiece(f"{title} ({mode}, {branch})", truths[0], predictions, start=first)

@@ -17,14 +17,14 @@ from memmlp.cli.options import outputs_option, plugins_option
     type=click.Path(path_type=Path, dir_okay=False),
     help="HTML file to write.  [default: report.html in --outputs]",
 )
-@click.option("--no-replays", is_flag=True, help="Leave out the worst seconds of the best runs in 3D.")
+@click.option("--no-replays", is_flag=True, help="Leave out the 3D replays of the best runs' worst seconds.")
 @plugins_option
 @outputs_option
 def report(sweeps: tuple[str, ...], out: Path | None, no_replays: bool, outputs: Path) -> None:
-    """Write the page of `memmlp ui` as one file, which needs neither server nor network.
+    """Write the page of `memmlp ui` as one file, which works offline.
 
-    SWEEPS are sweep files, numbers of the paper's tables, or folders below outputs/sweeps; by default all
-    sweeps. The file has their runs and tables, and all searches.
+    SWEEPS are sweep files, numbers of the paper's tables, or folders in outputs/sweeps. The default is all
+    sweeps. The file contains the runs and tables of these sweeps, and all searches.
     """
     from memmlp.cli.table import write
     from memmlp.cli.ui import predict

@@ -1,4 +1,4 @@
-"""`memmlp results`: runs' results that are kept with the code, and the pages made from them."""
+"""`memmlp results`: keep results of runs with the code, and make pages from these results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FOLDER = Path("docs/results")
 
 @click.group("results")
 def results() -> None:
-    """Keep the results of runs with the code, and make pages of them."""
+    """Keep the results of runs with the code, and make pages from these results."""
 
 
 @results.command("save")
@@ -41,25 +41,26 @@ def results() -> None:
     type=click.Path(path_type=Path, file_okay=False),
     default=FOLDER / "data",
     show_default=True,
-    help="Folder for the file of results.",
+    help="Folder for the results file.",
 )
 @click.option(
     "--untrained",
     is_flag=True,
-    help="Measure networks without a run untrained; for tables of costs alone (16, 17).",
+    help="Measure the costs of networks without a run, with random weights; only for Tables 16 and 17.",
 )
-@click.option("--name", "stem", help="Name of the file, without its ending.  [default: the sweep's name]")
+@click.option("--name", "stem", help="File name without suffix.  [default: the sweep's name]")
 @config_dir_option
 @plugins_option
 @outputs_option
 def save_command(
     name: str, overrides: tuple[str, ...], out: Path, untrained: bool, stem: str | None, outputs: Path
 ) -> None:
-    """Keep a sweep's results, the per-clip results of its finished runs, in one small file.
+    """Save the per-clip results of a sweep's finished runs in one small file.
 
-    SWEEP and OVERRIDES are those of `memmlp sweep`. A file that has results of further runs is not replaced.
+    SWEEP and OVERRIDES are those of `memmlp sweep`. The command does not replace a file that has results of
+    additional runs.
     """
-    from memmlp.cli.table import shown_sweep
+    from memmlp.cli.table import load_shown_sweep
     from memmlp.common.files import make_json_safe
     from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import (
@@ -73,7 +74,7 @@ def save_command(
     from memmlp.report.tables.measured_run import load_measured_run
 
     sweep = find_sweep(name, overrides)
-    shown = shown_sweep(sweep, overrides, outputs.absolute())
+    shown = load_shown_sweep(sweep, overrides, outputs.absolute())
     runs, flags = (
         find_finished_runs(shown.sweep, make_run_finder(shown.plan, functools.cache(load_measured_run))),
         shown.flags,
@@ -92,7 +93,7 @@ def save_command(
         flags,
     )
     if not kept.all_runs:
-        raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
+        raise InputError(f"sweep {name}: has no finished runs; run the sweep with: {kept.command}")
     path = out / f"{stem or sweep.name}.json"
     if path.exists():
         try:
@@ -108,7 +109,7 @@ folder_option = click.option(
     type=click.Path(path_type=Path, file_okay=False),
     default=FOLDER,
     show_default=True,
-    help="Folder of the pages, with data/ and templates/ below it.",
+    help="Folder of the pages, with the subfolders data and templates.",
 )
 
 
@@ -118,14 +119,16 @@ folder_option = click.option(
 @together_option
 @folder_option
 def show(name: str, source: str | None, together: tuple[str, ...], folder: Path) -> None:
-    """Print the table of kept results, without any run; NAME is that of their page."""
+    """Print the table of kept results. NAME is the name of their page; no run is needed."""
     from memmlp.cli.table import print_tables
     from memmlp.report.kept_results import load_kept_results
 
     path = folder / "data" / f"{name}.json"
     if not path.is_file():
         known = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
-        raise InputError(f"{path}: no such results; must be one of: {known or '(none are kept)'}")
+        raise InputError(
+            f"{path}: no results with this name; must be one of: {known or '(no results are kept)'}"
+        )
     print_tables([_make_table(load_kept_results(path), source, together)])
 
 
@@ -133,10 +136,10 @@ def show(name: str, source: str | None, together: tuple[str, ...], folder: Path)
 @folder_option
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 if a page differs.")
 def docs(folder: Path, check: bool) -> None:
-    """Make all pages of results from the kept results, without a training.
+    """Make all pages of results from the kept results, without training.
 
-    Each file of data/ gives a table's page, which counts seeds out of the sweep's definition. Templates give
-    pages whose sentences take their numbers and verdicts from the tables.
+    Each file in data/ becomes a page with a table, including the number of finished and missing seeds. Each
+    template becomes a page with numbers and verdicts from these tables.
     """
     from memmlp.common.files import atomic_write
     from memmlp.report.result_pages import MARK, make_pages
@@ -148,7 +151,10 @@ def docs(folder: Path, check: bool) -> None:
     stale = sorted(name for name, text in present.items() if text.startswith(MARK) and name not in pages)
     if check:
         for name in [*differing, *stale]:
-            click.echo(f"differs: {folder / name}; make it again with: memmlp results docs", err=True)
+            click.echo(
+                f"{folder / name}: differs from the kept results; update it with: memmlp results docs",
+                err=True,
+            )
         if differing or stale:
             raise SystemExit(1)
     else:
@@ -161,49 +167,51 @@ def docs(folder: Path, check: bool) -> None:
 
 
 def make_tables(folder: Path) -> dict[str, KeptTable]:
-    """Return the tables of all results kept below a folder, by the stems of their files."""
+    """Return the tables of all kept results in a folder, by file stem."""
     from memmlp.report.kept_results import load_kept_results
     from memmlp.report.result_pages import KeptTable
 
     if not (folder / "data").is_dir():
-        raise InputError(f"{folder}/data: no such folder; memmlp results save --out {folder}/data makes it")
+        raise InputError(
+            f"{folder}/data: no such folder; create it with: memmlp results save --out {folder}/data"
+        )
     found = {}
     for path in sorted((folder / "data").glob("*.json")):
         kept = load_kept_results(path)
-        sources = () if kept.rounds else kept.sources  # rounds decide verdicts of all clips together
+        sources = () if kept.rounds else kept.sources  # verdicts by seed rounds need all clips
         by_source = tuple(_make_table(kept, source) for source in sources)
         found[path.stem] = KeptTable(kept, _make_table(kept), by_source, partial(_make_table, kept, None))
     return found
 
 
 def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
-    """Compute the table of kept results, over the sweep's seeds and all further ones of their runs.
+    """Compute the table of kept results for the sweep's seeds and all additional seeds with runs.
 
     Args:
         kept: the results.
-        source: the only source whose test clips are shown; None for all.
-        patterns: test clips that match the same text of a pattern are one group.
+        source: show only the test clips of this source; None for all sources.
+        patterns: test clips form one group if a pattern matches the same text in their names.
     """
-    from memmlp.cli.table import flag_of_other_rounds
+    from memmlp.cli.table import flag_changed_rounds
     from memmlp.config.compose_plan import find_sweep
     from memmlp.report.tables.build_table import make_table, restrict_and_group_clips
     from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.runs.identity import list_outdated
 
-    # With the command line's overrides, the table warns of other data than its own.
+    # With the command line's overrides, the table warns about changed data.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)
     flags: list[str] = []
     rounds = Rounds.from_json(kept.rounds) if kept.rounds else None
-    other = flag_of_other_rounds(rounds, sweep) if rounds else None
+    other = flag_changed_rounds(rounds, sweep) if rounds else None
     if rounds and not other:
         if source or patterns:
-            raise InputError("--source, --together: need a fixed number of seeds, not rounds")
+            raise InputError("--source, --together: need a fixed number of seeds, without --until-decided")
         spent = rounds.restrict_sweep(sweep)
         table = make_table(
             spent, kept.select_runs(spent), command=f"{kept.command} --until-decided", rounds=rounds
         )
     else:
-        # Seeds of the definition without a kept run are missing: one seed of five is not a finished table.
+        # Seeds without a kept run count as missing, because a table with one of five seeds is not finished.
         seeds = sorted({*sweep.seeds, *(seed for by_seed in kept.runs.values() for seed in by_seed)})
         sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
         sweep, runs, restricted = restrict_and_group_clips(sweep, kept.select_runs(sweep), source, patterns)

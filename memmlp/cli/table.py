@@ -1,4 +1,4 @@
-"""`memmlp table`: measured values beside those that the paper prints."""
+"""`memmlp table`: show measured values beside the paper's values."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     "--format",
     "form",
     type=click.Choice(["md", "tex", "json"]),
-    help="Format to print in.  [default: a table for the screen]",
+    help="Output format.  [default: a table for the screen]",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="File to write the table into; its ending sets the format.",
+    help="File to write the table to; its suffix sets the format.",
 )
 @click.option(
     "--mode",
     type=click.Choice(list(SHOWN_MODES)),
     default="both",
     show_default=True,
-    help="Mode of evaluation whose errors are shown.",
+    help="Evaluation mode of the errors to show.",
 )
 @click.option(
     "--branch",
     type=click.Choice(BRANCHES),
-    help="Branch whose errors are shown.  [default: that of the paper's table]",
+    help="Branch of the errors to show.  [default: as in the paper's table]",
 )
 @source_option
 @together_option
@@ -65,15 +65,17 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Add measurements of a browser: a file of the bench of memmlp web. For Table 17; repeatable.",
+    help="File of browser measurements to add to Table 17, from the benchmark of memmlp web; repeatable.",
 )
 @click.option(
     "--untrained",
     is_flag=True,
-    help="Measure networks without a run untrained; for tables of costs alone (16, 17).",
+    help="Measure the costs of networks without a run, with random weights; only for Tables 16 and 17.",
 )
 @click.option(
-    "--seeds-needed", is_flag=True, help="Show how many seeds would find the paper's effects on this data."
+    "--seeds-needed",
+    is_flag=True,
+    help="Show the number of seeds needed to detect the paper's effects with this data.",
 )
 @config_dir_option
 @plugins_option
@@ -92,18 +94,19 @@ def table(
     seeds_needed: bool,
     outputs: Path,
 ) -> None:
-    """Show the table of a sweep: NAME is a file's path, a shipped sweep, a table's number, or `all`.
+    """Show the table of a sweep.
 
-    OVERRIDES are those that the sweep was run with; they find its runs again.
+    NAME is the path of a sweep file, a shipped sweep, the number of a table, or `all`. Use the same OVERRIDES
+    as in `memmlp sweep`, so that the command finds the sweep's runs.
     """
     from memmlp.report.tables import rows_measured_in_browsers
     from memmlp.report.tables.measured_run import load_measured_run
 
     measured = [rows_measured_in_browsers.read_bench(path) for path in add]
     selection = TableSelection(branch, source, together, untrained)
-    gc.disable()  # what is read from the runs stays in use, and searching it for garbage takes a second
+    gc.disable()  # garbage collection takes a second and finds nothing here
     try:
-        found = gather(
+        found = gather_tables(
             name, overrides, outputs, SHOWN_MODES[mode], functools.cache(load_measured_run), selection
         )
     finally:
@@ -115,7 +118,7 @@ def table(
     if form is None and out is None:
         print_tables(tables)
         return
-    text = _formatted(tables, form or _form_of(out), alone=name != "all")
+    text = _format_tables(tables, form or _choose_format(out), alone=name != "all")
     if out is None:
         click.echo(text, nl=False)
     else:
@@ -123,7 +126,7 @@ def table(
 
 
 def print_needed_seeds(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
-    """Print, sweep by sweep, how many seeds the paper's effects need."""
+    """Print the number of seeds that the paper's effects need, for each sweep."""
     from memmlp.report.tables.effects import compute_needed_seeds
     from memmlp.report.tables.table_text import make_caption
 
@@ -132,16 +135,16 @@ def print_needed_seeds(found: Sequence[SweepTable], modes: Sequence[str]) -> Non
         for row in compute_needed_seeds(one.sweep, one.runs, modes):
             numbers = f"{row.paper:+.2f}", f"{row.measured:+.2f}", str(row.seeds)
             rows.append((*row.key, *numbers, str(row.needed or "no number is enough")))
-        click.echo("\n".join([make_caption(one.table), *aligned(rows, left=3), ""]))
+        click.echo("\n".join([make_caption(one.table), *align_columns(rows, left=3), ""]))
 
 
 class TableSelection(NamedTuple):
-    """What of a sweep's results its table shows.
+    """A selection of a sweep's results for its table.
 
     Attributes:
-        branch: the branch to show in place of the variants' own; None for the variants' own.
-        source: the only source whose test clips are shown; None for all.
-        together: patterns of test clips that count as one group, beside the groups of the data.
+        branch: the branch to show; None for each variant's default branch.
+        source: show only the test clips of this source; None for all sources.
+        together: patterns of test clips that count as one group, in addition to the groups of the data.
         untrained: whether to measure the costs of networks without a run, with random weights.
     """
 
@@ -151,7 +154,7 @@ class TableSelection(NamedTuple):
     untrained: bool = False
 
 
-WHOLE = TableSelection()
+EVERYTHING = TableSelection()
 
 
 class SweepTable(NamedTuple):
@@ -162,29 +165,29 @@ class SweepTable(NamedTuple):
     table: Table
 
 
-def gather(
+def gather_tables(
     name: str,
     overrides: Sequence[str],
     outputs: Path,
     modes: Sequence[str],
     read: ReadRun,
-    selection: TableSelection = WHOLE,
+    selection: TableSelection = EVERYTHING,
 ) -> list[SweepTable]:
-    """Gather the tables with a name.
+    """Make the tables of one sweep, or of all tables of the paper.
 
-    A table of the paper whose config lacks something (such as the folder of AMASS) shows only the paper's
-    values, and says so.
+    If the config of a paper's table is incomplete (for example without the folder of AMASS), the table shows
+    only the paper's values and the reason.
 
     Args:
-        name: the name of a sweep, as given to `memmlp table`; `all` for all tables of the paper.
+        name: the name of a sweep, as in `memmlp table`; `all` for all tables of the paper.
         overrides: the command line's overrides.
         outputs: the folder of runs and caches.
-        modes: modes of evaluation to show.
-        read: reads a run (`memmlp.report.tables.measured_run.load_measured_run`).
-        selection: what of the results is shown.
+        modes: evaluation modes to show.
+        read: function that reads a run (`memmlp.report.tables.measured_run.load`).
+        selection: the results to show.
 
     Raises:
-        InputError: if none of them can be composed with the command line's overrides, or has that selection.
+        InputError: if no table can be composed with these overrides, or no table has the selected results.
     """
     from memmlp.common.progress import progress_bar
     from memmlp.report.tables.build_table import make_empty_table
@@ -198,8 +201,8 @@ def gather(
 
             check_costs(sweep)
         try:
-            known = shown_sweep(sweep, overrides, outputs.absolute())
-            found.append(table_of_plan(known, modes, command, read, selection))
+            shown = load_shown_sweep(sweep, overrides, outputs.absolute())
+            found.append(make_plan_table(shown, modes, command, read, selection))
         except InputError as error:
             failures.append(error)
             table = make_empty_table(sweep, modes, f"nothing measured: {error}")
@@ -210,14 +213,14 @@ def gather(
     return found
 
 
-def table_of_plan(
+def make_plan_table(
     shown: ShownSweep,
     modes: Sequence[str],
     command: str,
     read: ReadRun,
-    selection: TableSelection = WHOLE,
+    selection: TableSelection = EVERYTHING,
 ) -> SweepTable:
-    """Return a planned sweep's finished runs, and the table of a part of their results."""
+    """Return a planned sweep's finished runs, and the table of the selected results."""
     from memmlp.report.tables.build_table import (
         find_finished_runs,
         make_run_finder,
@@ -229,7 +232,7 @@ def table_of_plan(
     sweep, plan, rounds, flags = shown
     for option, given in (("source", selection.source), ("together", " ".join(selection.together))):
         if given and rounds:
-            raise InputError(f"--{option} {given}: does not go with rounds of seeds (--until-decided)")
+            raise InputError(f"--{option} {given}: cannot be combined with --until-decided")
     runs = find_finished_runs(sweep, make_run_finder(plan, read))
     if selection.untrained:
         from memmlp.config.untrained_costs import with_costs
@@ -244,7 +247,7 @@ def table_of_plan(
 
 
 def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
-    """Find the sweeps with a name and overrides, and return each with the command that runs it."""
+    """Find the sweeps with a name and overrides; return each sweep with its command."""
     from memmlp.config.compose_plan import find_sweep
     from memmlp.config.plugins import config_dir_words, packaged
 
@@ -256,7 +259,7 @@ def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
 
 
 def print_tables(tables: Sequence[Table]) -> None:
-    """Print tables in the width of the screen."""
+    """Print tables for the width of the screen."""
     from rich.console import Console
 
     from memmlp.report.tables.table_text import print_table
@@ -266,8 +269,8 @@ def print_tables(tables: Sequence[Table]) -> None:
         print_table(one, console)
 
 
-def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:
-    """Return rows as lines of columns, of which the first `left` are aligned to the left."""
+def align_columns(rows: Sequence[Sequence[str]], left: int) -> list[str]:
+    """Return rows as lines of columns, with the first `left` columns aligned to the left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(f"{text:{'<' if i < left else '>'}{widths[i]}}" for i, text in enumerate(row))
@@ -275,8 +278,8 @@ def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:
     ]
 
 
-def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
-    """Return the tables as one text; in JSON, it is a single object if `alone`, else a list."""
+def _format_tables(tables: Sequence[Table], form: str, alone: bool) -> str:
+    """Format the tables as one text; in JSON, a single object if `alone`, otherwise a list."""
     from memmlp.report.tables.table_text import FORMATS
 
     texts = [FORMATS[form](one) for one in tables]
@@ -285,17 +288,17 @@ def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
     return "\n".join(texts)
 
 
-def _form_of(out: Path | None) -> str:
+def _choose_format(out: Path | None) -> str:
     from memmlp.report.tables.table_text import FORMATS
 
     ending = out.suffix.removeprefix(".") if out else ""
     if ending not in FORMATS:
-        raise InputError(f"--out {out}: expected an ending of {', '.join(FORMATS)}, or --format")
+        raise InputError(f"--out {out}: must have the suffix {', '.join(FORMATS)}, or needs --format")
     return ending
 
 
 def write(out: Path, text: str) -> None:
-    """Write the file of --out and print its path. Raises InputError if it can't be written."""
+    """Write the file of --out and print its path. Raises InputError if the file cannot be written."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
@@ -305,13 +308,13 @@ def write(out: Path, text: str) -> None:
 
 
 class ShownSweep(NamedTuple):
-    """The part of a sweep that a table shows, if seeds may have been spent in rounds.
+    """The part of a sweep that a table shows; seed rounds may have added seeds.
 
     Attributes:
-        sweep: the sweep with the seeds that were spent.
-        plan: the plan of its runs.
-        rounds: the rounds that decided the verdicts; None if no rounds did.
-        flags: what a reader has to know if rounds were of something else.
+        sweep: the sweep with the seeds that were run.
+        plan: the plan of the sweep's runs.
+        rounds: the seed rounds that decided the verdicts, or None.
+        flags: warnings for readers, if saved seed rounds do not fit the sweep.
     """
 
     sweep: Sweep
@@ -320,55 +323,58 @@ class ShownSweep(NamedTuple):
     flags: tuple[str, ...] = ()
 
 
-def shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownSweep:
-    """Return the sweep with its rounds, if interim analyses were done and fit the sweep's present form.
+def load_shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownSweep:
+    """Load a sweep's plan, and its seed rounds if interim analyses were done.
 
-    Otherwise the sweep is shown with its own seeds; if analyses were done, a flag says so.
+    If the sweep has changed since the analyses, the rounds are ignored and a flag warns about them.
     """
     from memmlp.config.compose_plan import make_plan
     from memmlp.report.tables.seed_rounds import Rounds, check_same_runs
 
-    path = rounds_path(sweep, outputs)
+    path = get_rounds_path(sweep, outputs)
     kept = Rounds.read(path)
     if kept is None or not kept.analyses:
         return ShownSweep(sweep, make_plan(sweep, outputs), None)
     seeds_given = any(override.startswith("seed=") for override in overrides)
-    if flag := flag_of_other_rounds(kept, sweep, seeds_given):
+    if flag := flag_changed_rounds(kept, sweep, seeds_given):
         return ShownSweep(sweep, make_plan(sweep, outputs), None, (flag,))
     spent = kept.restrict_sweep(sweep)
     plan = make_plan(spent, outputs)
     try:
         check_same_runs(kept, sweep, plan, path)
     except InputError as error:
-        return ShownSweep(spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",))
+        return ShownSweep(spent, plan, None, (f"earlier interim analyses do not apply: {error}",))
     return ShownSweep(spent, plan, kept)
 
 
-def flag_of_other_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) -> str | None:
-    """Return a flag if the sweep has changed since its interim analyses; else None.
+def flag_changed_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) -> str | None:
+    """Return a warning if the sweep has changed since its interim analyses, or None.
 
-    `seeds_given` says that the sweep's seeds were given on the command line.
+    Args:
+        kept: the saved seed rounds.
+        sweep: the sweep.
+        seeds_given: whether the command line sets the sweep's seeds.
     """
     from memmlp.report.tables.seed_rounds import start_rounds
 
     other = "seeds" if seeds_given else kept.find_difference(start_rounds(sweep, len(kept.seeds)))
     if other is None:
         return None
-    return f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
+    return f"earlier interim analyses used other {other}, so the error rate of these verdicts can exceed 5 %"
 
 
-def flag_of_earlier_rounds(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
-    """Return a flag for a table with a fixed number of seeds if interim analyses were done before."""
+def flag_earlier_rounds(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
+    """Return a warning for a table with a fixed number of seeds if interim analyses were done before."""
     from memmlp.report.tables.seed_rounds import Rounds
 
-    kept = Rounds.read(rounds_path(sweep, outputs))
+    kept = Rounds.read(get_rounds_path(sweep, outputs))
     if kept is None or not kept.analyses:
         return ()
-    return ("seeds were spent in rounds before; memmlp table has their verdicts, these do not keep the 5 %",)
+    return ("after interim analyses, the error rate of these verdicts can exceed 5 %; see memmlp table",)
 
 
-def rounds_path(sweep: Sweep, outputs: Path) -> Path:
-    """Return the file in which a sweep's rounds are kept."""
+def get_rounds_path(sweep: Sweep, outputs: Path) -> Path:
+    """Return the path of a sweep's saved seed rounds."""
     from memmlp.config.compose_plan import sweep_folder
     from memmlp.report.tables.seed_rounds import ROUNDS_FILE
 

@@ -1,4 +1,4 @@
-"""`memmlp train`: a Hydra application with errors of one line, which are raised before anything runs."""
+"""`memmlp train`: a Hydra application that reports config errors in one line before anything runs."""
 
 from __future__ import annotations
 
@@ -47,29 +47,28 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
 
     Args:
         argv: the arguments.
-        job: what to do with each composed and checked config; by default, to train it.
+        job: called with each checked config; by default, `run_training`.
 
     Raises:
-        InputError: for bad input; of several failed jobs, the last failure is raised and the others are
-            printed.
+        InputError: for bad input. If several jobs fail, the last failure is raised; the others are printed.
     """
     args = parse(argv)
-    shows = any((args.hydra_help, args.cfg, args.info, args.shell_completion))
+    only_prints = any((args.hydra_help, args.cfg, args.info, args.shell_completion))
     if args.help or args.cfg:
         check_overrides(args)
     if args.help:
         click.echo(help_text(args))
         return
-    jobs = [] if shows else preflight(args)
+    jobs = [] if only_prints else preflight(args)
     if len(jobs) > 1 and distributed.world_size() > 1:
         raise InputError("torchrun: several processes train one run; start it without --multirun")
-    _check_predictions(jobs)
+    _check_prediction_folders(jobs)
     failures: list[Exception] = []
-    task = _collecting(job or run_training, failures)
+    task = _collect_failures(job or run_training, failures)
     keys = [override.key for override in parse_overrides(args.overrides)]
-    hydras = any(key.startswith(("hydra.", "hydra/")) for key in keys)
-    if shows or args.multirun or args.config_name or hydras:  # for Hydra's launchers and its own keys
-        _run_hydra(args, task)
+    has_hydra_keys = any(key.startswith(("hydra.", "hydra/")) for key in keys)
+    if only_prints or args.multirun or args.config_name or has_hydra_keys:  # needs Hydra's launchers or keys
+        _run_with_hydra(args, task)
     else:
         task(jobs[0])
     for failure in failures[:-1]:
@@ -78,10 +77,10 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         raise failures[-1]
 
 
-def _run_hydra(args: argparse.Namespace, task: Callable[[DictConfig], None]) -> None:
-    """Run or show the jobs by Hydra, which reads its arguments from `sys.argv`.
+def _run_with_hydra(args: argparse.Namespace, task: Callable[[DictConfig], None]) -> None:
+    """Run or print the jobs with Hydra, which reads its arguments from `sys.argv`.
 
-    Hydra raises its errors instead of printing them; its own messages become one line.
+    Errors of Hydra are raised as InputError, with a message in one line.
     """
     main = hydra.main(config_path=str(packaged("conf")), config_name=CONFIG, version_base=VERSION_BASE)
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
@@ -100,8 +99,8 @@ def _run_hydra(args: argparse.Namespace, task: Callable[[DictConfig], None]) -> 
             os.environ["HYDRA_FULL_ERROR"] = full_error
 
 
-def _check_predictions(jobs: Sequence[DictConfig]) -> None:
-    """Raise InputError for a folder without a name, or one in which several jobs would save predictions."""
+def _check_prediction_folders(jobs: Sequence[DictConfig]) -> None:
+    """Raise InputError if save_predictions is empty, or several jobs would save predictions in one folder."""
     if any(cfg.save_predictions is not None and not cfg.save_predictions.strip() for cfg in jobs):
         raise InputError("save_predictions=: must be a folder, or null to save none")
     folders = [cfg.save_predictions for cfg in jobs if cfg.save_predictions]
@@ -113,13 +112,13 @@ def _check_predictions(jobs: Sequence[DictConfig]) -> None:
             )
 
 
-def _collecting(
+def _collect_failures(
     job: Callable[[DictConfig], object], failures: list[Exception]
 ) -> Callable[[DictConfig], None]:
-    """Wrap the job so that its expected failures are kept, and the other jobs of a multirun still run.
+    """Wrap the job: expected failures are appended to `failures`, so the other jobs of a multirun still run.
 
-    A launcher that runs jobs in other processes has only copies of the list there. So failures are raised in
-    these, and Hydra passes the first one on.
+    Some launchers run jobs in other processes, with copies of the list. There, failures are raised, and Hydra
+    passes the first failure on.
     """
     collector = os.getpid()
 
@@ -135,10 +134,10 @@ def _collecting(
 
 
 def run_training(cfg: DictConfig) -> Outcome | None:
-    """Finish the run of a checked config, and print and return the results.
+    """Finish the run of a checked config, then print and return the results.
 
     Returns:
-        The outcome; None in the processes that trained along.
+        The outcome; None in the additional processes of distributed training.
     """
     from memmlp.cli.train_summary import show
     from memmlp.config.build_request import build_request

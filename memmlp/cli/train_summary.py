@@ -1,4 +1,4 @@
-"""What `memmlp train` prints at the end of a run."""
+"""The summary that `memmlp train` prints at the end of a run."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from memmlp.sweep.definition import BRANCHES
 from memmlp.training.request import Outcome
 
 STAGES = ("training", "evaluation", "deployment")
-COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
+MODES_AND_BRANCHES = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
 
 
 def show(outcome: Outcome) -> None:
-    """Print a run's metrics in both modes, its latency and sizes if it has any, and where its files are."""
+    """Print a run's metrics in both modes, its latency and sizes if measured, and its folder."""
     run, results = outcome.run, outcome.results
-    lines: list[Any] = [describe_stages(outcome), *map(warn, run_warnings(run))]
-    lines += [metrics_table(results), *source_tables(run, outcome.stage_ids)]
+    lines: list[Any] = [describe_stages(outcome), *map(format_warning, list_run_warnings(run))]
+    lines += [make_metrics_table(results), *make_source_tables(run, outcome.stage_ids)]
     if "latency" in results:
         lines += describe_latency(results["latency"])
     lines.append(f"run      {run.folder}")
@@ -52,20 +52,20 @@ def show(outcome: Outcome) -> None:
         console.print(line, soft_wrap=not isinstance(line, Table))
 
 
-def warn(line: str) -> Text:
-    """Return a line in the colour of warnings."""
+def format_warning(line: str) -> Text:
+    """Return the line in yellow."""
     return Text(line, style="yellow")
 
 
-def run_warnings(run: Run) -> Iterator[str]:
-    """Yield warnings about a run: of a part of the data, of changed code, or hardly trained."""
+def list_run_warnings(run: Run) -> Iterator[str]:
+    """Yield warnings about a run with incomplete data, changed code, or too little training."""
     if partial := run.manifest.get("partial"):
-        yield f"on a part of the data: {partial}"
+        yield f"incomplete data: {partial}"
     if changed := run.changed_sources:
         names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
         yield (
-            f"run {run.id} was made before the code of {names} changed, under the same component versions: "
-            "force=true makes it again"
+            f"the code of {names} has changed since run {run.id}, without a new component version; "
+            "force=true repeats the run"
         )
     if remark := warn_if_hardly_trained(count_training_frames(run)):
         yield remark
@@ -74,16 +74,16 @@ def run_warnings(run: Run) -> Iterator[str]:
 def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
     """Print the errors of several networks, by name, on the same test clips, and their costs.
 
-    The errors are those in stream mode if that was measured. A network whose branches differ has a column
-    for each.
+    The errors are in stream mode if it was measured, otherwise in window mode. If a network's branches
+    differ, each branch has a column.
     """
     results = {name: outcome.results for name, outcome in outcomes.items()}
     mode = "stream" if all("stream" in own for own in results.values()) else "window"
-    branches = {name: _differing(own[mode]) for name, own in results.items()}
+    branches = {name: _list_distinct_branches(own[mode]) for name, own in results.items()}
     columns = [(name, branch) for name, own in branches.items() for branch in own]
     headers = [f"{name}\n{branch}" if len(branches[name]) > 1 else name for name, branch in columns]
     errors = [results[name][mode][branch] for name, branch in columns]
-    table = _error_table(f"side by side, {mode}", headers, errors)
+    table = _make_error_table(f"side by side, {mode}", headers, errors)
     if all("latency" in own for own in results.values()):
         costs = [select_deployed_measurements(results[name]["latency"]) for name, _ in columns]
         table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
@@ -91,8 +91,8 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
     Console(highlight=False).print(table)
 
 
-def _differing(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the branches whose positions differ: those of a network that predicts rotations alone don't."""
+def _list_distinct_branches(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the branches with distinct positions; a network without a position branch has only one."""
     differing: list[str] = []
     for branch in (branch for branch in BRANCHES if branch in branches):
         own = branches[branch][SHARED_METRIC]
@@ -105,7 +105,7 @@ def _differing(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
-    """Yield lines about the time of a frame in the requested exported file, and the network's size."""
+    """Yield lines about the time per frame in the requested exported file, and the network's size."""
     measured, precision = select_deployed_measurements(record), find_deployed_precision(record)
     lower = precision != "fp32"
     file = f" in {precision}" if lower else ""
@@ -116,21 +116,21 @@ def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
     )
     cost = record.get(precision) or {}
     if precision in INT8_PRECISIONS and "jitter_growth" in cost and not is_accurate_enough(cost):
-        yield warn(
+        yield format_warning(
             f"{precision}: MPJPE {cost['growth']:+.1%}, Jitter {cost['jitter_growth']:+.1%}, more than "
-            f"{MAX_GROWTH:.0%} and {MAX_JITTER_GROWTH:.0%}: live use takes float32"
+            f"{MAX_GROWTH:.0%} and {MAX_JITTER_GROWTH:.0%}: memmlp live uses float32"
         )
     if (share := min(measured.get(key, 1.0) for key in CORE_SHARES.values())) < MIN_CORE_SHARE:
-        yield warn(f"the machine was busy: it had a core for {share:.0%} of the time; its times are too long")
+        yield format_warning(
+            f"the machine was busy: a core was available {share:.0%} of the time, so the times are too long"
+        )
     if "pose_median_ms" in measured:
         yield (
             f"an end-to-end pose, trackers to joints: {measured['pose_median_ms']:.2f} ms median, "
             f"{measured['pose_p95_ms']:.2f} ms p95 (timed with the network in the caches)"
         )
     own, whole = measured["parameters"], measured["parameters_with_vqvae"]
-    others = (
-        f" ({whole / 1e6:.2f} M with parts that are frozen or for training alone)" if whole != own else ""
-    )
+    others = f" ({whole / 1e6:.2f} M including frozen and training-only parts)" if whole != own else ""
     yield (
         f"{own / 1e6:.2f} M parameters{others}, {measured['macs'] / 1e6:.3g} MMAC a frame, "
         f"ONNX file {measured['onnx_bytes'] / 1e6:.1f} MB, graph included"
@@ -138,42 +138,42 @@ def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
 
 
 def describe_stages(outcome: Outcome) -> str:
-    """Return a line about which stages were made now, and which existed already."""
+    """Return a line that lists the stages of this call and the stages that were finished before."""
     if not outcome.made:
-        return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
+        return f"run {outcome.run.id} is finished already; nothing was done (force=true repeats it)"
     stages = [stage for stage in STAGES if stage != "deployment" or "latency" in outcome.results]
     before = [stage for stage in stages if stage not in outcome.made]
     ending = f"; {' and '.join(before)} done before" if before else ""
     return f"run {outcome.run.id}: {', '.join(outcome.made)} done{ending}"
 
 
-def source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:
+def make_source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:
     """Yield a table of the metrics on each source's test clips, if the run's data has several sources.
 
     Args:
         run: the run.
-        stages: the identities of the evaluations that are shown.
+        stages: the identities of the evaluations to show.
     """
     for source, measured in load_measured_run(run.folder, stages).split_by_source().items():
-        yield metrics_table(measured.means, f"test clips of {source} ({len(measured.clips)})")
+        yield make_metrics_table(measured.means, f"test clips of {source} ({len(measured.clips)})")
 
 
-def metrics_table(results: Errors, title: str = "test clips") -> Table:
+def make_metrics_table(results: Errors, title: str = "test clips") -> Table:
     """Make a table of the metrics on test clips, with a column for each mode and branch."""
-    columns = [(mode, branch) for mode, branch in COLUMNS if branch in results.get(mode, {})]
+    columns = [(mode, branch) for mode, branch in MODES_AND_BRANCHES if branch in results.get(mode, {})]
     headers = [f"{mode}\n{branch}" for mode, branch in columns]
     errors = [results[mode][branch] for mode, branch in columns]
-    return _error_table(title, headers, errors, padding=(0, 1, 0, 0))
+    return _make_error_table(title, headers, errors, padding=(0, 1, 0, 0))
 
 
-def _error_table(
+def _make_error_table(
     title: str, headers: Sequence[str], errors: Sequence[Mapping[str, Any]], **style: Any
 ) -> Table:
     columns = [Column("metric"), Column("unit"), *(Column(header, justify="right") for header in headers)]
     table = Table(*columns, title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, **style)
     for metric, unit in UNITS.items():
         values = [column.get(metric) for column in errors]
-        if any(value is not None for value in values):  # a custom metric may not have been asked for
+        if any(value is not None for value in values):  # not every column has custom metrics
             numbers = ("-" if value is None else f"{float(value):.2f}" for value in values)
             table.add_row(metric, unit, *numbers)
     return table

@@ -1,4 +1,4 @@
-"""`memmlp tune`: search loss weights, or any config keys, by the errors on validation."""
+"""`memmlp tune`: search loss weights, or any config keys, by the validation errors."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ if TYPE_CHECKING:
 @click.command("tune")
 @click.argument("overrides", nargs=-1)
 @worker_options
-@click.option("--status", is_flag=True, help="Show the search's progress, and run nothing.")
+@click.option("--status", is_flag=True, help="Only show the search's progress.")
 @click.option(
     "--config-dir",
     type=click.Path(path_type=Path),
-    help="Folder of custom configs, searched beside memmlp's; they may name custom classes.",
+    help="Folder of additional configs; they can refer to your own classes.",
 )
 @plugins_option
 @outputs_option
 def tune(
     overrides: tuple[str, ...], workers: Workers, status: bool, config_dir: Path | None, outputs: Path
 ) -> None:
-    """Search the manual loss weights: the paper's first, then what Optuna proposes.
+    """Search the manual loss weights: first the paper's weights, then Optuna's proposals.
 
-    OVERRIDES are those of `memmlp train` for all trials, those of the search (`search.n_trials=50`,
-    `search.seeds=3`, `search.objectives=[MPJPE,Jitter] search.pruner=none`, `+search.space.optim.lr={low:
-    1e-4, high: 1e-2, log: true}`; `search=NAME` takes conf/search/NAME.yaml), and the executor's of `memmlp
-    sweep`. A restarted search goes on where it stopped.
+    OVERRIDES can be overrides of `memmlp train` for all trials, settings of the executor as in `memmlp
+    sweep`, or settings of the search: `search.n_trials=50`, `search.seeds=3`,
+    `search.objectives=[MPJPE,Jitter] search.pruner=none`, or `+search.space.optim.lr={low: 1e-4, high: 1e-2,
+    log: true}`. `search=NAME` selects conf/search/NAME.yaml. A restarted search continues where it stopped.
     """
     from memmlp.common.files import write_json
     from memmlp.sweep.search.study import Study
 
-    if workers.executor == "debug":  # it would wait in this process for its own trials
+    if workers.executor == "debug":  # the search would wait for trials in its own process
         raise InputError("executor=debug: expected local, slurm, ray or dask for a search")
     setup = prepare_search(overrides, config_dir, outputs.absolute())
     if status:
@@ -59,18 +59,18 @@ def tune(
         study = Study.open(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)
         write_results(setup, study)
-    summary(setup, study)
+    print_summary(setup, study)
 
 
-class Setup(NamedTuple):
-    """A search, its folder, and the settings of its trials' runs.
+class SearchSetup(NamedTuple):
+    """A search, its folder, and the settings of its runs.
 
     Attributes:
         search: the parsed search.
         command_line: the command line's overrides for all trials.
         outputs: the folder of runs and caches.
         folder: the folder of the search.
-        config_dir: a folder of custom configs; None for none.
+        config_dir: a folder of custom configs, or None.
     """
 
     search: Search
@@ -79,21 +79,21 @@ class Setup(NamedTuple):
     folder: Path
     config_dir: Path | None
 
-    def overrides(self, values: Mapping[str, Value]) -> list[str]:
+    def list_overrides(self, values: Mapping[str, Value]) -> list[str]:
         """Return a trial's overrides: the search's base, the command line's, and the trial's values.
 
-        Trials are judged on validation alone; they are exported and timed only if that is asked for.
+        Trials are judged only on validation clips. By default they are not exported and timed.
         """
         return ["export.graph=off", *self.search.base, *self.command_line, *self.search.overrides(values)]
 
     @property
     def config_options(self) -> list[str]:
-        """The options of a command that finds the custom configs."""
+        """The command-line options for the custom configs."""
         return ["--config-dir", str(self.config_dir)] if self.config_dir else []
 
 
-def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: Path) -> Setup:
-    """Return the search of a command line, with keys and ranges checked against the config.
+def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: Path) -> SearchSetup:
+    """Return the search of a command line. Its keys and ranges are checked against the config.
 
     Raises:
         InputError: if a key is wrong; the message names it.
@@ -107,27 +107,27 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     own = [text for text in overrides if Override.parse(text).group == "search"]
     content = compose_plain("tune", own, config_dir).get("search")
     if not isinstance(content, dict):
-        raise InputError("search: has no value; expected the name of a file in conf/search")
+        raise InputError("search: must be the name of a file in conf/search")
     activate(find_named(map(str, content.get("base") or ())))
-    wanted = parse_search(content)
+    parsed = parse_search(content)
     remaining = tuple(text for text in overrides if text not in own)
-    setup = Setup(wanted, remaining, outputs, outputs / "tune" / wanted.name, config_dir)
+    setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
     base = _check_space(setup)
-    counted = {**asdict(wanted), "n_trials": None, "storage": None}
-    return setup._replace(folder=outputs / "tune" / f"{wanted.name}-{digest([base, counted])[:8]}")
+    counted = {**asdict(parsed), "n_trials": None, "storage": None}
+    return setup._replace(folder=outputs / "tune" / f"{parsed.name}-{digest([base, counted])[:8]}")
 
 
-def _check_space(setup: Setup) -> str:
-    """Check the ranges of a search, and describe what a trial's numbers depend on.
+def _check_space(setup: SearchSetup) -> str:
+    """Check the ranges of a search, and describe everything that affects the results of its trials.
 
     Returns:
-        A text that names the first trial's run, its interval of validations, how its network is used, and
-        the component versions that the ends of the space use. It is part of the digest in the name of the
-        search's folder, so that another config or other data makes another search.
+        A text with the first trial's run, its validation interval, its inference settings, and the component
+        versions at the limits of the space. The folder name of the search contains a digest of this text, so
+        a search with another config or data has another folder.
 
     Raises:
-        InputError: if a searched key is set on the command line or does not change the training, or if the
-            config refuses a value.
+        InputError: if a searched key is set on the command line or does not affect training, or if the
+            config rejects a value.
     """
     from memmlp.common.files import digest
     from memmlp.runs.identity import affects_training, select_inference_config, select_validation_config
@@ -135,12 +135,14 @@ def _check_space(setup: Setup) -> str:
     space = setup.search.space
     for override in map(Override.parse, setup.command_line):
         if override.key in {one.key for one in space}:
-            raise InputError(f"{override}: is searched; remove it from the space with search.space....=null")
-    requests = [_requests(setup, {})[0]]
+            raise InputError(
+                f"{override}: is searched; remove it from the space with search.space.{override.key}=null"
+            )
+    requests = [_make_requests(setup, {})[0]]
     for number in range(max(len(one.corners()) for one in space)):
         corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
         try:
-            requests.append(_requests(setup, corner)[0])
+            requests.append(_make_requests(setup, corner)[0])
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
     configs = [request.config for request in requests]
@@ -150,33 +152,35 @@ def _check_space(setup: Setup) -> str:
         for key in sorted(first_validation.keys() | other.keys()):
             if first_validation.get(key) != other.get(key):
                 raise InputError(
-                    f"search.space: {key} changes the validation clips of the trials; expected of data only "
-                    "weighting, mirror, split.train_fraction and sources.NAME.weight"
+                    f"search.space: {key} changes the validation clips of the trials; keys of data must be "
+                    "weighting, mirror, split.train_fraction or sources.NAME.weight"
                 )
     for one in space:
-        # Some change it at other values than 0.
+        # Some keys change the training only at values other than 0.
         counts = any(affects_training(one.key, config) for config in configs)
         if not isinstance(configs[0].get(one.key), Mapping) and not counts:
-            raise InputError(f"search.space: {one.key}: does not change the training")
-    first = _tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
-    often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
-    trained = digest([one.identity("").id for one in requests])  # what the first trial need not have
+            raise InputError(f"search.space.{one.key}: does not change the training")
+    first = _make_tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
+    often = f"validated every {first.config['optim']['validate_every']} steps"  # trials can be pruned then
+    trained = digest(
+        [one.identity("").id for one in requests]
+    )  # the first trial may lack components of the limits
     return f"{first.id}, {often}, used with {select_inference_config(first.config)}, trained with {trained}"
 
 
-def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
+def _make_tasks(setup: SearchSetup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
     from memmlp.config.compose_plan import tasks_of
 
-    requests = _requests(setup, values)
+    requests = _make_requests(setup, values)
     return [tasks_of(request, request.motion.prepare().digest) for request in requests]
 
 
-def _requests(setup: Setup, values: Mapping[str, Value]) -> list[RunRequest]:
-    """Return the checked requests of a trial: one for the config's seed, and one for each further seed."""
+def _make_requests(setup: SearchSetup, values: Mapping[str, Value]) -> list[RunRequest]:
+    """Return the checked requests of a trial, one for each seed."""
     from memmlp.config.build_request import build_request
     from memmlp.config.compose import composed
 
-    cfg = composed([*setup.config_options, *setup.overrides(values)])
+    cfg = composed([*setup.config_options, *setup.list_overrides(values)])
     cfg.paths.outputs = str(setup.outputs)
     first, found = cfg.seed, []
     for number in range(setup.search.seeds):
@@ -185,7 +189,7 @@ def _requests(setup: Setup, values: Mapping[str, Value]) -> list[RunRequest]:
     return found
 
 
-def show(setup: Setup) -> None:
+def show(setup: SearchSetup) -> None:
     """Print the progress of the search."""
     from rich.console import Console
 
@@ -196,30 +200,30 @@ def show(setup: Setup) -> None:
     Console(highlight=False).print(render(study, setup.outputs) if study else "not started")
 
 
-def search(setup: Setup, study: Study, workers: Workers) -> None:
-    """Run the study until it has as many trials as are wanted."""
+def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
+    """Run the study until it has all trials of the search."""
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.search.director import Director, direct
     from memmlp.sweep.search.progress_table import SearchBoard
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
-    base = _requests(setup, {})[0]
+    base = _make_requests(setup, {})[0]
     digest = base.motion.prepare().digest
 
     def check() -> None:
-        """Raise InputError if the data has another digest now, by which further trials would be judged."""
+        """Raise InputError if the data has changed, because further trials would be judged on other clips."""
         if base.motion.prepare().digest != digest:
             raise InputError(
-                f"{base.motion.clips.root}: its clips changed since the search started; restore them, or "
-                "start the search again as another one"
+                f"{base.motion.clips.root}: clips have changed since the search started; restore them, or "
+                "start a new search"
             )
 
-    director = Director(study, partial(_tasks, setup), plan, check)
+    director = Director(study, partial(_make_tasks, setup), plan, check)
     path, fleet = start_fleet(setup.folder, plan, workers, {base.config["device"]})
     direct(director, fleet, SearchBoard(setup.outputs), path)
 
 
-def write_results(setup: Setup, study: Study) -> None:
+def write_results(setup: SearchSetup, study: Study) -> None:
     """Write the results of the search into its folder."""
     from memmlp.config.plugins import packaged
     from memmlp.sweep.search import results
@@ -233,8 +237,8 @@ def write_results(setup: Setup, study: Study) -> None:
         click.echo(str(error), err=True)
 
 
-def summary(setup: Setup, study: Study) -> None:
-    """Print the best trials, the importance of the keys, where the files are, and the next command.
+def print_summary(setup: SearchSetup, study: Study) -> None:
+    """Print the best trials, the importance of the keys, the folder, and the next command.
 
     Exits with 1 if no trial is complete.
     """
@@ -250,7 +254,7 @@ def summary(setup: Setup, study: Study) -> None:
     best = study.best()
     if best:
         title = "Pareto front" if len(study.search.objectives) > 1 else "best trial"
-        table = trials_table(study.search, f"{title}, errors on validation")
+        table = trials_table(study.search, f"{title}, validation errors")
         for trial in best:
             add_row(table, study.search, trial, Text(figures(trial)))
         console.print(table)
@@ -261,14 +265,14 @@ def summary(setup: Setup, study: Study) -> None:
     for line in boundary_warnings(study.study):
         click.echo(line)
     click.echo(count_trials(study))
-    request = _requests(setup, {})[0]
+    request = _make_requests(setup, {})[0]
     if part := describe_missing_data(request.config, request.motion.prepare()):
-        click.echo(f"on a part of the data: {part}")
+        click.echo(f"incomplete data: {part}")
     click.echo(f"in {setup.folder}")
     if best:
-        words = setup.overrides(trial_values(best[0], setup.search))[1:]
+        words = setup.list_overrides(trial_values(best[0], setup.search))[1:]
         click.echo(f"next: memmlp train {shlex.join([*setup.config_options, *words])}")
     else:
         reasons = [trial.user_attrs["reason"] for trial in study.trials if "reason" in trial.user_attrs]
-        click.echo(f"no trial is complete; the last failure: {(reasons or ['NaN errors'])[-1]}")
+        click.echo(f"no trial is complete; last failure: {(reasons or ['NaN errors'])[-1]}")
         raise SystemExit(1)

@@ -1,4 +1,4 @@
-"""`memmlp ui`: runs, sweeps and searches on a page of this machine."""
+"""`memmlp ui`: a local web page of runs, sweeps and searches."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import host_option, outputs_option, page_options, plugins_option, token_option
+from memmlp.cli.options import add_page_options, host_option, outputs_option, plugins_option, token_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 
 @click.command("ui")
-@page_options(port=8787)
+@add_page_options(port=8787)
 @host_option
 @token_option
 @plugins_option
 @outputs_option
 def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path) -> None:
-    """Show runs, sweeps and searches on a page of this machine, which follows them live.
+    """Show runs, sweeps and searches on a local web page, with live updates.
 
-    The page only reads. Ctrl-C ends it. docs/guides/ui.md describes the page.
+    The page never changes a run. Ctrl-C stops the server. docs/guides/ui.md describes the page.
     """
     import webbrowser
 
@@ -46,10 +46,10 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
 
 
 def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
-    """Return a run's prediction for a test clip (`make_prediction_arrays`), on one CPU thread.
+    """Return a run's prediction for a test clip (`make_prediction_arrays`), computed on one CPU thread.
 
     Raises:
-        InputError: if the run's data is no longer prepared here, or does not have that clip.
+        InputError: if the run's data is not prepared on this machine, or does not contain the clip.
     """
     import torch
 
@@ -57,7 +57,7 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
     from memmlp.config.open_run import OpenedRun, clip_of, data_of, experiment_of
     from memmlp.evaluation.predictions import predict_clip
 
-    torch.set_num_threads(1)  # trainings on this machine need the others
+    torch.set_num_threads(1)  # leaves the other threads to training processes
     experiment = experiment_of(run)
     if experiment.motion.digest() is None:
         raise InputError(f"run {run.id}: its data is not prepared here; prepare it with memmlp eval {run.id}")

@@ -1,4 +1,4 @@
-"""`memmlp web`: a static site that times networks, plays clips and shows the wearer, in a browser."""
+"""`memmlp web`: a static site that times networks, plays clips and shows the user's body in a browser."""
 
 from __future__ import annotations
 
@@ -7,30 +7,41 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import PATH, Finite, check_runs, outputs_option, plugins_option, remark_on
+from memmlp.cli.options import (
+    PATH,
+    FiniteFloat,
+    check_runs_exist,
+    outputs_option,
+    plugins_option,
+    warn_about_training,
+)
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
     from memmlp.live.web.site import SiteClip, SiteNetwork
 
 BASE = ("profile=paper", "model=avatar_poser")
-"""The network with which the bench compares: AvatarPoser in the paper's size, with random weights."""
+"""The reference network of the benchmark: AvatarPoser with its paper's size and random weights."""
 
 
 @click.command("web")
 @click.argument("runs", nargs=-1, required=True)
 @click.option("--out", required=True, type=PATH, help="Folder to write the site into.")
 @click.option(
-    "--clips", default=3, show_default=True, type=click.IntRange(1, 50), help="Test clips of each run."
+    "--clips",
+    default=3,
+    show_default=True,
+    type=click.IntRange(1, 50),
+    help="Number of test clips to include from each run.",
 )
 @click.option(
     "--seconds",
     default=20.0,
     show_default=True,
-    type=Finite(1, 600),
-    help="Longest part of a clip, from its middle, seconds.",
+    type=FiniteFloat(1, 600),
+    help="Maximum length of a clip in seconds; longer clips are cut to their middle.",
 )
-@click.option("--no-bench", is_flag=True, help="Leave out the bench, and the graphs that it times.")
+@click.option("--no-bench", is_flag=True, help="Leave out the benchmark and its network graphs.")
 @plugins_option
 @outputs_option
 def web(
@@ -41,12 +52,12 @@ def web(
     no_bench: bool,
     outputs: Path,
 ) -> None:
-    """Make a site of finished RUNS (ids, their beginnings, or folders) that any static server can serve.
+    """Make a static web site of finished RUNS (ids, beginnings of ids, or folders).
 
-    In the browser, such as a headset's, it times each network, plays test clips, and shows the wearer's body
-    in a mirror (docs/guides/web.md). The command downloads onnxruntime-web from the npm registry, once.
+    In a browser, including a headset's, the site times each network, plays test clips, and shows the user's
+    body in a mirror (docs/guides/web.md). The first call downloads onnxruntime-web from the npm registry.
     """
-    check_runs(outputs, *runs)
+    check_runs_exist(outputs, *runs)
     from memmlp.common.errors import InputError
     from memmlp.config.build import untrained
     from memmlp.config.open_run import open_run
@@ -56,21 +67,21 @@ def web(
     opened = [open_run(outputs, run) for run in dict.fromkeys(runs)]
     if len({one.run.id for one in opened}) < len(opened):
         raise InputError(f"{' '.join(runs)}: expected each run only once")
-    found = {one.run.id: pack_clips(one, clips, seconds) for one in opened}
-    networks = [describe_network(one, found[one.run.id]) for one in opened]
+    clips_by_run = {one.run.id: pack_clips(one, clips, seconds) for one in opened}
+    networks = [describe_network(one, clips_by_run[one.run.id]) for one in opened]
     base = None if no_bench else SiteNetwork("avatar-poser", "AvatarPoser", RANDOM, untrained(BASE))
     site = Site(
         networks=networks,
         base=base,
-        clips=list({clip.key: clip for some in found.values() for clip in some}.values()),
+        clips=list({clip.key: clip for some in clips_by_run.values() for clip in some}.values()),
     )
     size = site.write(out)
     click.echo(f"{out}: {size / 1e6:.1f} MB; serve it with: python -m http.server --directory {out}")
-    remark_on(*(one.run for one in opened))
+    warn_about_training(*(one.run for one in opened))
 
 
 def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
-    """Return the middle parts of some test clips of a run, evenly spread over all of them."""
+    """Return the middle parts of up to `count` test clips of a run, evenly spaced in the list of clips."""
     import numpy as np
 
     from memmlp.live.web.site import pack_clip
@@ -81,7 +92,7 @@ def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 
 
 def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
-    """Return a run's network in the form that a site needs."""
+    """Return a run's network with the facts that the site shows."""
     from memmlp.live.web.site import SiteNetwork
     from memmlp.networks.streaming import check_is_stream
     from memmlp.runs.identity import flatten

@@ -22,23 +22,22 @@ if TYPE_CHECKING:
     from memmlp.sweep.executors.local import Share
     from memmlp.sweep.plan import Plan
 
-EXECUTORS = ("local", "slurm", "ray", "dask", "debug")  # the last one is for debuggers
-WITHOUT_GPU = {"cpu", "mps"}  # devices of runs that need no GPU of CUDA
-OWN_SETTINGS = ("slurm", "ray", "dask")  # executors with settings NAME.KEY=VALUE
-CUSTOM = "executor"  # the settings executor.KEY=VALUE are those of an executor that is the path of a class
+EXECUTORS = ("local", "slurm", "ray", "dask", "debug")  # debug runs everything in this process, for debuggers
+DEVICES_WITHOUT_GPU = {"cpu", "mps"}  # devices that do not need a CUDA GPU
+EXECUTORS_WITH_SETTINGS = ("slurm", "ray", "dask")  # executors with settings NAME.KEY=VALUE
+CUSTOM_PREFIX = "executor"  # prefix of the settings of a custom executor, executor.KEY=VALUE
 
 
 @dataclass(frozen=True)
 class Workers:
-    """The workers that a command line asks for.
+    """The workers that a command line requests.
 
     Attributes:
         executor: the executor's name, or the path of a class.
-        settings: the executor's own settings, KEY -> VALUE of overrides like slurm.KEY=VALUE.
-        count: how many run at once; None for a number that fits the machine.
-        gpus_per_worker: GPUs of a worker on this machine; None for 1 if there are GPUs.
-        workers_per_gpu: the largest number of workers that share a GPU of this machine; None for as many as
-            are needed.
+        settings: the executor's settings, KEY -> VALUE of overrides like slurm.KEY=VALUE.
+        count: number of concurrent workers; None for the default of this machine.
+        gpus_per_worker: number of GPUs per worker on this machine; None for 1 if GPUs are available.
+        workers_per_gpu: maximum number of workers that share a GPU of this machine; None for no limit.
     """
 
     executor: str = "local"
@@ -52,12 +51,12 @@ class Workers:
         for option, value in given.items():
             if value is not None and self.executor != "local":
                 raise InputError(
-                    f"{option}: is for workers of this machine, not for executor={self.executor}"
+                    f"{option}: needs workers of this machine, executor=local, not {self.executor}"
                 )
-        self.options()
+        self.parse_options()
 
-    def options(self) -> Any:
-        """Return the executor's own settings, checked. Raises InputError for a wrong one."""
+    def parse_options(self) -> Any:
+        """Parse and check the executor's settings. Raises InputError for a wrong setting."""
         if self.executor == "slurm":
             import_optional("submitit", "slurm", "executor=slurm")
             from memmlp.sweep.executors.slurm import slurm_options
@@ -70,32 +69,32 @@ class Workers:
         module = ray_cluster if self.executor == "ray" else dask_cluster
         return parse_settings(self.executor, self.settings, module.SETTINGS)
 
-    def script(self, folder: Path) -> str:
-        """Return the file that sbatch would get; empty for executors without one."""
+    def make_batch_script(self, folder: Path) -> str:
+        """Return the batch file for sbatch; an empty text for executors other than Slurm."""
         if self.executor != "slurm":
             return ""
         from memmlp.sweep.executors.slurm import batch_script
 
-        return batch_script(logs(folder), self.options(), self.number())
+        return batch_script(get_log_path(folder), self.parse_options(), self.count_workers())
 
-    def number(self, shares: Sequence[Share] = ()) -> int:
-        """Return how many workers run at once, given the shares of GPUs that they have on this machine."""
+    def count_workers(self, shares: Sequence[Share] = ()) -> int:
+        """Return the number of concurrent workers, given their shares of this machine's GPUs."""
         from memmlp.sweep.executors.local import worker_count
 
         return worker_count(shares, self.count, self.workers_per_gpu)
 
-    def shares(self, devices: Iterable[str]) -> list[Share]:
-        """Return the shares of this machine's GPUs that local workers get for runs on these devices.
+    def make_gpu_shares(self, devices: Iterable[str]) -> list[Share]:
+        """Divide this machine's GPUs into shares for local workers, for runs on these devices.
 
         Args:
             devices: the values of the key `device` of the runs.
 
         Raises:
-            InputError: if a run asks for a GPU that its worker can't have; the message names the key.
+            InputError: if a run requests a GPU that its worker cannot use; the message names the key.
         """
         from memmlp.sweep.executors.local import divide_gpus, visible_gpus
 
-        wanted = [name for name in devices if name not in WITHOUT_GPU]
+        wanted = [name for name in devices if name not in DEVICES_WITHOUT_GPU]
         local = self.executor == "local"
         gpus = visible_gpus() if wanted and local and self.gpus_per_worker != 0 else ()
         for name in wanted:
@@ -113,18 +112,18 @@ class Workers:
         return divide_gpus(gpus, self.gpus_per_worker)
 
     def start_executor(self, folder: Path, shares: Sequence[Share], gpus: bool) -> Executor:
-        """Return the executor; its workers' logs are in `folder`/workers.
+        """Make the executor. Its workers write logs in `folder`/workers.
 
         Args:
             folder: the folder of the sweep or search.
             shares: the shares of this machine's GPUs for local workers.
-            gpus: whether runs may use a GPU.
+            gpus: whether runs can use a GPU.
         """
-        options = self.options()
+        options = self.parse_options()
         if self.executor == "slurm":
             from memmlp.sweep.executors.slurm import Slurm
 
-            return Slurm(logs(folder), options)
+            return Slurm(get_log_path(folder), options)
         if self.executor == "ray":
             from memmlp.sweep.executors.ray_cluster import Ray
 
@@ -136,36 +135,38 @@ class Workers:
         if "." in self.executor:
             from memmlp.config.plugins import import_object
 
-            return import_object(self.executor, "executor")(logs(folder), self.settings)
+            return import_object(self.executor, "executor")(get_log_path(folder), self.settings)
         from memmlp.sweep.executors.local import Debug, Local
 
-        return Debug() if self.executor == "debug" else Local(logs(folder), shares)
+        return Debug() if self.executor == "debug" else Local(get_log_path(folder), shares)
 
 
-def logs(folder: Path) -> Path:
-    """Return the path of the workers' logs for a sweep or search, with %j for a worker's number."""
+def get_log_path(folder: Path) -> Path:
+    """Return the path of the workers' logs for a sweep or search; %j stands for a worker's number."""
     return folder / "workers" / "%j"
 
 
 def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options about workers to a command, which gets their values as `workers`.
+    """Add the worker options to a command, which receives their values as `workers`.
 
-    The command gets the remaining overrides as its `overrides`.
+    The command receives the overrides without the executor's overrides as `overrides`.
     """
     options = (
         click.option(
             "--workers",
             "count",
             type=click.IntRange(1),
-            help="How many workers run at once.  [default: one a GPU, or without GPUs one a core]",
+            help="Number of concurrent workers.  [default: one per GPU, or one per core without GPUs]",
         ),
         click.option(
             "--gpus-per-worker",
             type=click.IntRange(0),
-            help="GPUs of each worker of this machine, 0 for none.  [default: 1 where there are any]",
+            help="Number of GPUs per worker on this machine.  [default: 1 if available, otherwise 0]",
         ),
         click.option(
-            "--workers-per-gpu", type=click.IntRange(1), help="Most workers that share a GPU of this machine."
+            "--workers-per-gpu",
+            type=click.IntRange(1),
+            help="Maximum number of workers that share a GPU of this machine.",
         ),
     )
 
@@ -187,52 +188,52 @@ def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple[str, ...]]:
-    """Split overrides into the executor's name, the executor's settings, and Hydra's overrides.
+    """Split overrides into the executor's name, the executor's settings, and the remaining overrides.
 
     Raises:
-        InputError: for an unknown executor, or settings of another one.
+        InputError: for an unknown executor, or settings of another executor.
     """
     executor, own, remaining = "local", [], []
     for override in map(Override.parse, overrides):
         if override.key == "executor":
             executor = override.value or ""
-        elif override.group in (*OWN_SETTINGS, CUSTOM):
+        elif override.group in (*EXECUTORS_WITH_SETTINGS, CUSTOM_PREFIX):
             own.append(override)
         else:
             remaining.append(override.text)
     if executor not in EXECUTORS and "." not in executor:
         raise InputError(f"executor={executor}: expected local, slurm, ray, dask or the path of a class")
     for override in own:
-        if override.group != (CUSTOM if "." in executor else executor):
-            name = "PATH, a custom executor" if override.group == CUSTOM else override.group
-            raise InputError(f"{override.key}: is for executor={name}")
+        if override.group != (CUSTOM_PREFIX if "." in executor else executor):
+            name = "PATH, a custom executor" if override.group == CUSTOM_PREFIX else override.group
+            raise InputError(f"{override.key}: needs executor={name}")
     settings = {one.key.partition(".")[2]: one.value or "" for one in own}
     return executor, settings, tuple(remaining)
 
 
 def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> tuple[Path, Fleet]:
-    """Save the plan in a file for this process alone, and return the file with a fleet of workers for it.
+    """Save the plan in a new file, and return the file and a fleet of workers for it.
 
-    No worker is started yet. Other processes that work on the same sweep have files of their own, so that
-    none of them changes the plan of this one's workers.
+    No worker is started yet. Each process that works on the same sweep has a separate file, so it cannot
+    change the plan of another process's workers.
 
     Args:
-        folder: the folder of the sweep or search, which also holds the workers' logs.
+        folder: the folder of the sweep or search; workers' logs are also stored there.
         plan: the plan to work on.
-        workers: what the command line asks for.
+        workers: the workers that the command line requests.
         devices: the values of the key `device` of the plan's runs.
 
     Raises:
-        InputError: if workers can't have the GPUs that are asked for.
+        InputError: if workers cannot get the requested GPUs.
     """
     from memmlp.config.worker_process import work
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence
 
     named = set(devices)
-    shares = workers.shares(named)
-    count = workers.number(shares)
-    may_use_gpu = not named <= WITHOUT_GPU
+    shares = workers.make_gpu_shares(named)
+    count = workers.count_workers(shares)
+    may_use_gpu = not named <= DEVICES_WITHOUT_GPU
     executor = workers.start_executor(folder, shares, may_use_gpu)
     own = folder / "controllers" / uuid4().hex
     path = own.with_suffix(".json")

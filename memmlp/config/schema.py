@@ -34,7 +34,7 @@ from memmlp.runs.deployment_folder import ONNX_FILES
 class SplitConfig:
     """What all splits have in common."""
 
-    name: str = setting(text())  # seeded, lists or subsets
+    name: str = setting(text())  # the kind of split: seeded, lists or subsets
     val: float = setting(fraction())
     seed: int = setting(at_least(0), 0)
     groups: list[str] = setting(each(empty=True))
@@ -97,7 +97,7 @@ class DataConfig:
 @dataclass
 class SynthDataConfig(DataConfig):
     root: str = setting(text())
-    synth: Settings | None = None  # a generator
+    synth: Settings | None = None  # settings of the motion generator
     split: SeededSplitConfig = group(SeededSplitConfig)
 
 
@@ -159,10 +159,11 @@ class ProfileConfig:
     Components declare their sizes for it; any of them can be overridden in its own group.
     """
 
-    sizes: str = setting(one_of(*SIZES))  # which of their sizes components have
-    reading: str = setting(one_of("default", "literal"), "default")  # literal: the paper's text word by word
-    # the width of Mem-MLP's and AGRoL's hidden states, to which the memory's is proportional; null: that of
-    # `sizes`
+    sizes: str = setting(one_of(*SIZES))  # the size of every component: tiny, small or paper
+    # literal: follows the paper's text exactly
+    reading: str = setting(one_of("default", "literal"), "default")
+    # the width of the hidden states of Mem-MLP and AGRoL; the memory's width is proportional to it. null: the
+    # width that `sizes` sets
     width: int | None = setting(at_least(1), None)
     synth_minutes: float | None = setting(positive(), None)
     steps: int = setting(at_least(1))
@@ -190,10 +191,10 @@ class NormalizerConfig:
     The paper mentions neither coordinates nor normalisation; the network measured better with both.
     """
 
-    # heading: seen as the head looks; head_relative: horizontal positions relative to the head; world
-    # (reading 20)
+    # heading: rotated by the head's heading; head_relative: horizontal positions relative to the head; world:
+    # world coordinates (docs/readings.md, no. 20)
     coordinates: str = setting(_coordinates(), "heading", literal="world")
-    # by mean and deviation of the training part (reading 20)
+    # true: normalise by mean and deviation of the training clips (docs/readings.md, no. 20)
     z_scores: bool = setting(None, True, literal=False)
 
 
@@ -205,21 +206,22 @@ class VQVAEConfig:
     all frames of the training part alike: data.drawn_by and the sources' weights are for windows.
     """
 
-    codes: int = setting(at_least(1), tiny=8, small=64, paper=64)  # K, the number of code-vectors (reading 4)
+    codes: int = setting(at_least(1), tiny=8, small=64, paper=64)  # K, the number of code-vectors
     width: int = setting(at_least(1), tiny=16, small=128, paper=256)  # the width of latents and code-vectors
-    encoder_depth: int = setting(at_least(0), 4)  # L_enc, the encoder's blocks
-    decoder_depth: int = setting(at_least(0), 1)  # L_dec, the decoder's blocks
+    encoder_depth: int = setting(at_least(0), 4)  # L_enc, the number of encoder blocks
+    decoder_depth: int = setting(at_least(0), 1)  # L_dec, the number of decoder blocks
     commitment: float = setting(at_least(0), 0.25)  # the weight of the commitment loss
-    # the decay of the codes' running means (codebook: ema)
+    # the decay of the running means with codebook: ema
     decay: float = setting(within(0, 1, strict=True), 0.99)
-    # ema: running means; gradient: learned by the loss, as printed, which tends to collapse
+    # ema: codes are running means; gradient: the loss trains the codes, as in the paper, which tends to
+    # collapse
     codebook: str = setting(one_of("ema", "gradient"), "ema")
-    seed: int = setting(seed(), "${seed}")  # the run's own; one number for all seeds gives them one VQ-VAE
-    # the length in epochs of training frames
+    seed: int = setting(seed(), "${seed}")  # a fixed number makes all runs share one VQ-VAE
+    # the training length in epochs over the training frames; null: `steps` sets the length
     epochs: float | None = setting(positive(), tiny=None, small=None, paper=100)
-    steps: int | None = setting(at_least(1), tiny=20, small=2000, paper=None)  # the length in steps
-    batch: int = setting(at_least(1), tiny=32, small=256, paper=256)  # frames a step
-    # the learning rate, which is multiplied by 0.2 at 20, 50 and 70 % of the steps
+    steps: int | None = setting(at_least(1), tiny=20, small=2000, paper=None)  # the training length in steps
+    batch: int = setting(at_least(1), tiny=32, small=256, paper=256)  # number of frames per step
+    # the initial learning rate; it is multiplied by 0.2 at 20, 50 and 70 % of the steps
     lr: float = setting(positive(), tiny=1e-3, small=1e-3, paper=1e-4)
     weight_decay: float = setting(at_least(0), 1e-4)
 
@@ -233,15 +235,15 @@ def _metrics() -> Rule:
 class EvaluationConfig:
     """How a trained network is evaluated on the test clips."""
 
-    # window: windows that do not overlap; stream: one frame at a time on the network's own history (reading
-    # 21)
+    # window: windows that do not overlap; stream: one frame at a time, with the network's own predictions as
+    # history (docs/readings.md, no. 21)
     modes: list[str] = setting(each(one_of("window", "stream")), ["window", "stream"])
-    batch: int = setting(at_least(1), "${profile.evaluation_batch}")  # clips that are evaluated side by side
-    # lbfgs adds a result, "combined": rotations fitted to the position branch (Table 6, reading 11); arms:
-    # hands at their trackers
+    batch: int = setting(at_least(1), "${profile.evaluation_batch}")  # number of clips per batch
+    # lbfgs: adds the result "combined", rotations fitted to the position branch (Table 6; docs/readings.md,
+    # no. 11); arms: moves the hands to their trackers
     ik: str = setting(one_of("off", "lbfgs", "arms"), "off", literal="lbfgs")
-    ik_iterations: int = setting(at_least(1), 15)  # of lbfgs, the most for each frame (App. A)
-    # custom metrics (docs/guides/components.md)
+    ik_iterations: int = setting(at_least(1), 15)  # maximum number of lbfgs iterations per frame (App. A)
+    # paths of custom metrics (docs/guides/components.md)
     metrics: list[str] = setting(each(_metrics(), empty=True), [])
 
 
@@ -249,16 +251,16 @@ class EvaluationConfig:
 class ExportConfig:
     """How a trained network is deployed: exported as ONNX and timed."""
 
-    # how many steps are timed, after a warm-up
+    # number of timed steps after a warm-up
     latency_steps: int = setting(at_least(1), "${profile.latency_steps}")
-    # streaming: computes each frame's part once; naive: the network as trained; auto: streaming where it
-    # exists; off: no export
+    # streaming: computes each frame's features once; naive: the network as trained; auto: streaming if
+    # available, otherwise naive; off: no export
     graph: str = setting(one_of("auto", "streaming", "naive", "off"), "auto")
-    # int8, int8_blocks (for networks without a window) or fp16 add such a file beside the float32 one; live
-    # use takes integers where MPJPE grows by at most 1 % and Jitter by at most 10 %
+    # int8, int8_blocks (for networks without a window) and fp16 write an additional file beside the float32
+    # file. memmlp live uses integers if MPJPE grows by at most 1 % and Jitter by at most 10 %
     precision: str = setting(one_of(*ONNX_FILES), "fp32")
-    alone: bool = setting(default=False)  # true: time the network alone, too, as papers do (Table 17)
-    # the ONNX files' operator set; engines that read only older files need 15
+    alone: bool = setting(default=False)  # true: also time only the network, as papers do (Table 17)
+    # the operator set of the ONNX files; older inference engines need 15
     opset: int = setting(within(15, 26), 18)
 
 

@@ -59,10 +59,10 @@ class AGRoLMLPSettings(NetworkSettings):
     learning rates.
     """
 
-    frames: int = setting(at_least(2), tiny=11, small=196, paper=196)  # T, the frames of a window
+    frames: int = setting(at_least(2), tiny=11, small=196, paper=196)  # T, the number of frames in a window
     # d, the width of the hidden state
     width: int = setting(at_least(1), tiny=16, small=128, paper=512, width_fraction=1)
-    depth: int = setting(at_least(1), 12)  # blocks
+    depth: int = setting(at_least(1), 12)  # number of blocks
 
     defaults: ClassVar = {"loss": "agrol"}
 
@@ -158,9 +158,9 @@ class AGRoLDiffusionSettings(AGRoLMLPSettings):
 
     # d, the width of the hidden state
     width: int = setting(at_least(2), tiny=16, small=128, paper=512, width_fraction=1)
-    diffusion_steps: int = setting(at_least(1), 1000)  # steps of the noise schedule (cosine)
-    sampling_steps: int = setting(at_least(1), 5)  # calls of the denoiser for each window (DDIM)
-    # the seed of the noise that sampling starts from, the same for every window
+    diffusion_steps: int = setting(at_least(1), 1000)  # number of steps in the cosine noise schedule
+    sampling_steps: int = setting(at_least(1), 5)  # number of denoiser calls per window (DDIM)
+    # the seed of the initial noise of sampling; every window gets the same noise
     noise_seed: int = setting(at_least(0), 0)
 
     recipe: ClassVar = {"normalizer.z_scores": True}

@@ -113,16 +113,16 @@ class AvatarJLMSettings(NetworkSettings):
     Adam at 1e-4 with a drop to a tenth at 60 K steps.
     """
 
-    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
-    # d, the width of a token; the layers of the coarse pose have 2 d
+    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the number of frames in a window
+    # d, the width of a token; the layers for the coarse pose have width 2 d
     width: int = setting(at_least(4), tiny=16, small=32, paper=512)
-    # blocks: an encoder layer over the tokens of a frame, and one over the frames of a token
+    # number of blocks; each has one encoder layer over tokens and one over frames
     depth: int = setting(at_least(1), tiny=1, small=1, paper=6)
-    heads: int = setting(at_least(1), tiny=4, small=2, paper=8)  # heads of attention
+    heads: int = setting(at_least(1), tiny=4, small=2, paper=8)  # number of attention heads
     # the hidden width of the encoders' feed-forward layers
     feedforward: int = setting(at_least(1), tiny=64, small=128, paper=2048)
-    dropout: float = setting(fraction(), 0.1)  # in the encoders, while training
-    coarse_weight: float = setting(at_least(0), 1.0)  # the weight of the loss of the coarse pose's joints
+    dropout: float = setting(fraction(), 0.1)  # dropout in the encoders during training
+    coarse_weight: float = setting(at_least(0), 1.0)  # weight of the loss for the coarse pose's joints
 
     defaults: ClassVar = {"loss": "avatar_jlm"}
 

@@ -75,13 +75,13 @@ class AvatarPoserSettings(NetworkSettings):
     steps.
     """
 
-    frames: int = setting(at_least(2), tiny=10, small=40, paper=40)  # T, the frames of a window
+    frames: int = setting(at_least(2), tiny=10, small=40, paper=40)  # T, the number of frames in a window
     width: int = setting(at_least(1), tiny=16, small=64, paper=256)  # d, the width of the hidden state
-    depth: int = setting(at_least(1), 3)  # encoder layers
-    heads: int = setting(at_least(1), 8)  # heads of attention
+    depth: int = setting(at_least(1), 3)  # number of encoder layers
+    heads: int = setting(at_least(1), 8)  # number of attention heads
     # the hidden width of the encoder's feed-forward layers
     feedforward: int = setting(at_least(1), tiny=64, small=512, paper=2048)
-    dropout: float = setting(fraction(), 0.1)  # in the encoder, while training
+    dropout: float = setting(fraction(), 0.1)  # dropout in the encoder during training
 
     learns_newest_frame: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "avatar_poser"}
@@ -175,7 +175,7 @@ class EgoPoserSettings(AvatarPoserSettings):
     (docs/readings.md). The training settings are the same as for AvatarPoser.
     """
 
-    # T, the frames of a window; the encoder sees half as many
+    # T, the number of frames in a window; the encoder sees half as many
     frames: int = setting(at_least(2), tiny=20, small=80, paper=80)
 
     defaults: ClassVar = {"loss": "ego_poser"}

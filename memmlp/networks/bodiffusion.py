@@ -96,20 +96,20 @@ class BoDiffusionSettings(NetworkSettings):
     settings differ: AdamW with the profile's schedule, instead of 1e-5 without weight decay.
     """
 
-    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
-    # d, the width of the hidden state; below 132 it cannot pass on the noise of all rotations
+    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the number of frames in a window
+    # d, the width of the hidden state; a width below 132 cannot represent the noise of all rotations
     width: int = setting(at_least(2), tiny=16, small=192, paper=384)
-    depth: int = setting(at_least(1), tiny=2, small=4, paper=12)  # blocks
-    heads: int = setting(at_least(1), tiny=4, small=3, paper=6)  # heads of attention
-    diffusion_steps: int = setting(at_least(1), 1000)  # steps of the noise schedule (linear)
-    # calls of the denoiser for each window; all but the last, and those in the last 50 of diffusion_steps,
-    # add noise
+    depth: int = setting(at_least(1), tiny=2, small=4, paper=12)  # number of blocks
+    heads: int = setting(at_least(1), tiny=4, small=3, paper=6)  # number of attention heads
+    diffusion_steps: int = setting(at_least(1), 1000)  # number of steps in the linear noise schedule
+    # number of denoiser calls per window; each call adds noise, except the last call and calls within the
+    # last 50 steps of the schedule
     sampling_steps: int = setting(at_least(1), tiny=2, small=10, paper=25)
-    noise_seed: int = setting(at_least(0), 0)  # the seed of the samples' noise, the same for every window
-    noise_weight: float = setting(at_least(0), 1.0)  # the weight of the loss of the predicted noise
-    # the weight of the variational bound, from which the variances learn
+    noise_seed: int = setting(at_least(0), 0)  # the seed of the sampling noise, which every window shares
+    noise_weight: float = setting(at_least(0), 1.0)  # weight of the loss for the predicted noise
+    # weight of the variational bound, which trains the variances
     bound_weight: float = setting(positive(), 1.0)
-    offline: bool = setting(default=False)  # true: as published, with future frames; never a stream
+    offline: bool = setting(default=False)  # true: uses future frames, as published; cannot stream
 
     trains_by_itself: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "of_network"}

@@ -37,7 +37,8 @@ class ConstantPoseGraph(FrameGraph):
 class ConstantPoseSettings(NetworkSettings):
     """A baseline for tables: the average pose, which turns and moves with the head."""
 
-    frames: int = setting(at_least(2), tiny=10, small=40, paper=40)  # T, the frames of a training window
+    # T, the number of frames in a training window
+    frames: int = setting(at_least(2), tiny=10, small=40, paper=40)
 
     defaults: ClassVar = {"loss": "avatar_poser"}
     recipe: ClassVar = {"normalizer.coordinates": "heading", "normalizer.z_scores": True}

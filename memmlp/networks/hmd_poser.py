@@ -167,17 +167,17 @@ class HMDPoserSettings(NetworkSettings):
     drop after 300 of 400 epochs.
     """
 
-    # T, the frames of a training window, from zero states; live there is no window
+    # T, the number of frames in a training window, from zero states; live there is no window
     frames: int = setting(at_least(2), tiny=10, small=40, paper=40)
     width: int = setting(at_least(4), tiny=16, small=48, paper=256)  # d, the width of a token
-    depth: int = setting(at_least(1), 2)  # blocks: an LSTM for each token, then a transformer over the tokens
-    encoder_layers: int = setting(at_least(1), tiny=1, small=1, paper=3)  # encoder layers of a block
-    heads: int = setting(at_least(1), 8)  # heads of attention
+    depth: int = setting(at_least(1), 2)  # number of blocks: one LSTM per token, then a transformer
+    encoder_layers: int = setting(at_least(1), tiny=1, small=1, paper=3)  # number of encoder layers per block
+    heads: int = setting(at_least(1), 8)  # number of attention heads
     # the hidden width of the encoders' feed-forward layers
     feedforward: int = setting(at_least(1), tiny=64, small=256, paper=2048)
-    dropout: float = setting(fraction(), 0.1)  # in the encoders, while training
-    # the weight of the loss that keeps the body's predicted shape the same within a window; 0: no head for
-    # the shape
+    dropout: float = setting(fraction(), 0.1)  # dropout in the encoders during training
+    # weight of the loss that keeps the predicted body shape constant within a window; 0: the network does not
+    # predict the shape
     shape_weight: float = setting(at_least(0), 0.1)
 
     defaults: ClassVar = {"loss": "hmd_poser"}

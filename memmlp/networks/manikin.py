@@ -234,11 +234,10 @@ class ManikinSSettings(AvatarPoserSettings):
     foot. Training uses AdamW with the profile's schedule.
     """
 
-    dropout: float = setting(fraction(), 0.0)  # in the encoder, while training
-    # the weight of the losses of what the limbs are solved from: the trunk, swivels, elbows and knees,
-    # ankles, toes
+    dropout: float = setting(fraction(), 0.0)  # dropout in the encoder during training
+    # weight of the losses for the limb solver's inputs: trunk, swivel angles, elbows, knees, ankles and toes
     parts_weight: float = setting(at_least(0), 1.0)
-    turned: bool = setting(default=True)  # whether training windows are turned by random headings
+    turned: bool = setting(default=True)  # true: rotate training windows to random headings
 
     defaults: ClassVar = {"loss": "manikin_s"}
 
@@ -313,10 +312,10 @@ class ManikinLSettings(AvatarJLMSettings):
     profile's schedule.
     """
 
-    # the weight of the losses of what the limbs are solved from: rotations, swivels, ankles, toes
+    # weight of the losses for the limb solver's inputs: rotations, swivel angles, ankles and toes
     parts_weight: float = setting(at_least(0), 1.0)
-    turned: bool = setting(default=True)  # whether training windows are turned by random headings
-    # true: as MANIKIN-LN, whose windows do not overlap; never a stream
+    turned: bool = setting(default=True)  # true: rotate training windows to random headings
+    # true: MANIKIN-LN, with windows that do not overlap; cannot stream
     offline: bool = setting(default=False)
 
     defaults: ClassVar = {"loss": "manikin_l"}

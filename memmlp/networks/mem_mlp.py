@@ -163,7 +163,7 @@ class MemMLPGraph(StreamingGraph):
 class MemMLPSettings(Settings):
     """Mem-MLP's backbone (Sec. 3.2), with slots for memory, predictor and hand term."""
 
-    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
+    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the number of frames in a window
     # d, the width of the hidden state
     width: int = setting(at_least(1), tiny=16, small=128, paper=512, width_fraction=1)
     depth: int = setting(at_least(1), 8)  # L, the number of blocks

@@ -200,11 +200,11 @@ class NoMemory(Memory):
 class FeatureMemorySettings(Settings):
     """The keys of memories that provide a feature for some blocks."""
 
-    # which blocks of the backbone have it: the even ones (Sec. 4.1)
+    # backbone blocks that have a memory layer; default: the even blocks (Sec. 4.1)
     layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
-    # k, the width of the memory feature (reading 3), and the hidden size of a recurrent memory
+    # k, the width of the memory feature and the hidden size of a recurrent memory (docs/readings.md, no. 3)
     width: int = setting(at_least(1), tiny=8, small=48, paper=192, width_fraction=0.375)
-    # residual: x + f([x; z]); plain: Linear([block(x); z]), as Sec. 4.1 says (reading 3)
+    # residual: x + f([x; z]); plain: Linear([block(x); z]), as in Sec. 4.1 (docs/readings.md, no. 3)
     fusion: str = setting(one_of("residual", "plain"), "residual", literal="plain")
 
 

@@ -174,11 +174,12 @@ class OwnPastMemorySettings(FeatureMemorySettings):
             network, "" without a VQ-VAE.
     """
 
-    # window: the past window ends T frames ago; frame: it ends one frame ago (reading 6)
+    # window: the past window ends T frames ago; frame: it ends one frame ago (docs/readings.md, no. 6)
     shift: str = setting(one_of("frame", "window"), "window", literal="frame")
-    # first: a past frame's estimate from when it was the newest; latest: its latest estimate (reading 6)
+    # first: a past frame's first estimate; latest: its latest estimate (docs/readings.md, no. 6)
     history: str = setting(one_of("first", "latest"), "first", literal="latest")
-    # m at inference: a number in [0, 1], or sampled as in training, for which ONNX has 0.5 (reading 7)
+    # m at inference: a number in [0, 1], or sampled as in training; ONNX files replace sampled by 0.5
+    # (docs/readings.md, no. 7)
     blend: int | float | str = setting(within(0, 1, "sampled"), 0.5)
 
     codes: ClassVar[str] = ""

@@ -50,7 +50,7 @@ class Branch(nn.Module):
 class TwoBranchSettings(Settings):
     """A branch for rotations and a branch for positions (Sec. 3.2.2)."""
 
-    depth: int = setting(at_least(0), 2)  # MLP blocks in each branch (Sec. 4.1)
+    depth: int = setting(at_least(0), 2)  # number of MLP blocks in each branch (Sec. 4.1)
 
     positions: ClassVar[bool] = True
     memory_blocks: ClassVar[bool] = False
@@ -64,7 +64,7 @@ class TwoBranchMemorySettings(TwoBranchSettings):
     It needs a memory.
     """
 
-    depth: int = setting(at_least(1), 2)  # memory blocks in each branch
+    depth: int = setting(at_least(1), 2)  # number of memory blocks in each branch
 
     memory_blocks: ClassVar[bool] = True
 

@@ -270,19 +270,20 @@ class RecurrentPoserSettings(NetworkSettings):
     0.05 to 0.5 give similar MPJRE; higher ones reduce Jitter (docs/guides/recurrent-poser.md).
     """
 
-    # T, the frames of a training window, from a zero state; live there is no window
+    # T, the number of frames in a training window, from a zero state; live there is no window
     frames: int = setting(at_least(2), tiny=11, small=21, paper=120)
-    # recurrences side by side, each trained by itself; their rotations are averaged
+    # number of networks in the ensemble; each is trained separately, and their rotations are averaged
     members: int = setting(at_least(1), tiny=2, small=3, paper=2)
-    # d, the width of a member's hidden state and of each cell
+    # d, the width of the hidden state and the cells of each network in the ensemble
     width: int = setting(at_least(1), tiny=16, small=128, paper=160)
-    depth: int = setting(at_least(1), tiny=2, small=4, paper=2)  # blocks of a member
-    # mingru and lru: their states enter linearly, so that training computes all frames at once
+    # number of blocks in each network of the ensemble
+    depth: int = setting(at_least(1), tiny=2, small=4, paper=2)
+    # the recurrent cell; mingru and lru have linear recurrences, so training computes all frames in parallel
     cell: str = setting(one_of("gru", "lstm", "mingru", "lru"), "gru")
-    # global: rotations in the network's space; reaching: these, with arms that reach to the hands' trackers;
-    # local: relative to the parents
+    # global: rotations in the network's space; reaching: global rotations, with arms that reach the hand
+    # trackers; local: rotations relative to the parent joints
     output: str = setting(one_of("local", "global", "reaching"), "reaching")
-    expansion: int = setting(at_least(1), 1)  # the hidden width of the blocks' MLPs, in d
+    expansion: int = setting(at_least(1), 1)  # hidden width of the blocks' MLPs as a multiple of the width d
 
     carries_state: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "calm", "optim": "muon"}

@@ -33,13 +33,13 @@ class SAGERefinerSettings(Settings):
     """
 
     width: int = setting(at_least(1), tiny=8, small=96, paper=512)  # the width of the recurrent layers
-    depth: int = setting(at_least(1), 2)  # the number of recurrent layers
-    frames: int = setting(at_least(4), tiny=20, small=120, paper=500)  # frames of a training piece
-    # how many are drawn from the training clips, as windows are (data.drawn_by); shorter clips begin with
-    # their first frame until one is full
+    depth: int = setting(at_least(1), 2)  # number of recurrent layers
+    frames: int = setting(at_least(4), tiny=20, small=120, paper=500)  # number of frames in a training piece
+    # number of pieces to draw from the training clips (see data.drawn_by); short clips are padded by
+    # repeating the first frame
     pieces: int = setting(at_least(1), tiny=8, small=512, paper=2048)
-    velocities: str = setting(one_of("rotations", "joints"), "rotations")  # whose movement its loss compares
-    lr: float | None = setting(positive(), None)  # learning rate at the start; null: that of optim
+    velocities: str = setting(one_of("rotations", "joints"), "rotations")  # what the velocity loss compares
+    lr: float | None = setting(positive(), None)  # initial learning rate; null: optim.lr
 
     def build(self, network: MotionModel) -> RefinedModel:
         """Add a refiner with random weights behind a network."""

@@ -42,19 +42,20 @@ class RPMSettings(NetworkSettings):
     Training uses AdamW with the profile's schedule.
     """
 
-    # T, the frames of a training window: context, up to T - context - horizon of free running, horizon
+    # T, the number of frames in a training window: the context, up to T - context - horizon freely predicted
+    # frames, and the horizon
     frames: int = setting(at_least(2), tiny=24, small=80, paper=80)
     width: int = setting(at_least(1), tiny=16, small=96, paper=512)  # d, the width of the hidden state
-    depth: int = setting(at_least(1), tiny=2, small=2, paper=4)  # encoder layers
-    heads: int = setting(at_least(1), 4)  # heads of attention
+    depth: int = setting(at_least(1), tiny=2, small=2, paper=4)  # number of encoder layers
+    heads: int = setting(at_least(1), 4)  # number of attention heads
     # the hidden width of the encoder's feed-forward layers
     feedforward: int = setting(at_least(1), tiny=32, small=192, paper=1024)
-    dropout: float = setting(fraction(), 0.1)  # in the encoder, while training
-    # frames of its own past motion that it sees; of inputs it sees one more
+    dropout: float = setting(fraction(), 0.1)  # dropout in the encoder during training
+    # number of past frames of its predicted motion that the network sees; it sees one more frame of inputs
     context: int = setting(at_least(1), 10)
-    # true: the past that it makes itself in training has dropout, too; the released code uses none
+    # true: use dropout when predicting the past motion in training; the released code does not
     own_dropout: bool = setting(default=False)
-    # frames that it predicts: 10 in its paper's reactive setting, 20 in the smooth one
+    # number of frames to predict; RPM's paper uses 10 (reactive) or 20 (smooth)
     horizon: int = setting(at_least(1), 10)
 
     defaults: ClassVar = {"loss": "rpm"}

@@ -139,20 +139,22 @@ class SAGESettings(NetworkSettings):
     features follow its released code.
     """
 
-    frames: int = setting(at_least(2), tiny=8, small=20, paper=20)  # T, the frames of a window
+    frames: int = setting(at_least(2), tiny=8, small=20, paper=20)  # T, the number of frames in a window
     width: int = setting(at_least(1), tiny=16, small=128, paper=512)  # d, the width of the diffusion models
-    depth: int = setting(at_least(1), tiny=1, small=3, paper=12)  # their blocks
-    heads: int = setting(at_least(1), tiny=2, small=4, paper=8)  # their heads of attention
-    # the width of the VQ-VAEs and the decoder, even
+    depth: int = setting(at_least(1), tiny=1, small=3, paper=12)  # number of blocks in each diffusion model
+    # number of attention heads in the diffusion models
+    heads: int = setting(at_least(1), tiny=2, small=4, paper=8)
+    # the width of the VQ-VAEs and the decoder; must be even
     code_width: int = setting(at_least(2), tiny=16, small=64, paper=256)
-    # blocks of the decoder, and of each VQ-VAE's encoder and decoder
+    # number of blocks in the decoder and in each VQ-VAE's encoder and decoder
     code_depth: int = setting(at_least(1), tiny=1, small=2, paper=4)
-    code_heads: int = setting(at_least(1), tiny=2, small=4, paper=4)  # their heads of attention
-    dropout: float = setting(fraction(), 0.1)  # in their blocks, while training
-    diffusion_steps: int = setting(at_least(1), 1000)  # steps of the noise schedule
-    sampling_steps: int = setting(at_least(1), 5)  # calls of each diffusion model for each pose
-    noise: float = setting(at_least(0), 0.01)  # the standard deviation of the noise that sampling starts from
-    noise_seed: int = setting(at_least(0), 0)  # its seed, the same noise for every window
+    # number of attention heads in the VQ-VAEs and the decoder
+    code_heads: int = setting(at_least(1), tiny=2, small=4, paper=4)
+    dropout: float = setting(fraction(), 0.1)  # dropout in all these blocks during training
+    diffusion_steps: int = setting(at_least(1), 1000)  # number of steps in the noise schedule
+    sampling_steps: int = setting(at_least(1), 5)  # number of calls of each diffusion model per pose
+    noise: float = setting(at_least(0), 0.01)  # standard deviation of the initial noise of sampling
+    noise_seed: int = setting(at_least(0), 0)  # the seed of this noise; every window gets the same noise
 
     learns_newest_frame: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "sage", "prerequisite": "sage"}

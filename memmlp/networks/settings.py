@@ -20,7 +20,7 @@ class NetworkSettings(Settings):
         trains_by_itself: whether the network's own loss is enough to train it (`loss=of_network`).
     """
 
-    frames: int = setting(at_least(2))  # T, the frames of a training window
+    frames: int = setting(at_least(2))  # T, the number of frames in a training window
 
     learns_newest_frame: ClassVar[bool] = False
     carries_state: ClassVar[bool] = False

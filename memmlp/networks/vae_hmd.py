@@ -110,14 +110,14 @@ class VAEHMDSettings(NetworkSettings):
     time (our reading).
     """
 
-    # T, the frames of a training window, each a pose of its own; live there is no window
+    # T, the number of frames in a training window, each a pose of its own; live there is no window
     frames: int = setting(at_least(2), tiny=10, small=40, paper=40)
     width: int = setting(at_least(1), tiny=16, small=128, paper=256)  # d, the width of the hidden layers
-    depth: int = setting(at_least(1), 3)  # residual blocks of each encoder and of the decoder
-    latent: int = setting(at_least(1), 30)  # components of the latent
-    dropout: float = setting(fraction(), 0.2)  # in the blocks, while training
-    # the weight of the KL divergence beside its authors' loss, which is in the hundreds; beside
-    # loss=kinematic 0.01 is best, and latents collapse with 1
+    depth: int = setting(at_least(1), 3)  # number of residual blocks in each encoder and in the decoder
+    latent: int = setting(at_least(1), 30)  # number of components of the latent
+    dropout: float = setting(fraction(), 0.2)  # dropout in the blocks during training
+    # weight of the KL divergence. 1 suits the authors' loss, which is in the hundreds. With loss=kinematic,
+    # 0.01 is best and 1 makes the latents collapse
     divergence_weight: float = setting(at_least(0), 1.0)
 
     defaults: ClassVar = {"loss": "vae_hmd"}

@@ -39,16 +39,22 @@ class OptimSettings(Settings):
     """The keys that all optimisers have."""
 
     steps: int = setting(at_least(1), "${profile.steps}")
-    batch: int = setting(at_least(1), "${profile.batch}")  # windows a step
+    batch: int = setting(at_least(1), "${profile.batch}")  # number of windows per step
     lr: float = setting(positive(), "${profile.lr}")
     weight_decay: float = setting(at_least(0), 1.0e-4)
-    warmup: int = setting(at_least(0), 0)  # steps over which the learning rate first grows; 0 for none
-    clip_norm: float = setting(at_least(0), 0.0)  # the largest norm of the gradient; 0 for no limit
+    warmup: int = setting(at_least(0), 0)  # number of initial steps with a growing learning rate; 0: none
+    clip_norm: float = setting(at_least(0), 0.0)  # maximum norm of the gradient; 0: no limit
     precision: str = setting(one_of("fp32", "bf16"), "fp32")
-    compile: bool = setting(default=False)  # true: torch.compile the network
-    checkpoint_every: int = setting(at_least(1), "${profile.checkpoint_every}")  # steps between checkpoints
-    validate_every: int = setting(at_least(1), "${profile.validate_every}")  # steps between validations
-    log_every: int = setting(at_least(1), "${profile.log_every}")  # steps between entries of the metrics log
+    compile: bool = setting(default=False)  # true: compile the network with torch.compile
+    checkpoint_every: int = setting(
+        at_least(1), "${profile.checkpoint_every}"
+    )  # number of steps between checkpoints
+    validate_every: int = setting(
+        at_least(1), "${profile.validate_every}"
+    )  # number of steps between validations
+    log_every: int = setting(
+        at_least(1), "${profile.log_every}"
+    )  # number of steps between metrics log entries
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
@@ -65,12 +71,12 @@ class OptimSettings(Settings):
 class AdamWSettings(OptimSettings):
     """Training by AdamW (Sec. 4.1). Batch size and weight decay are AGRoL's (docs/readings.md, no. 12)."""
 
-    final_lr: float = setting(at_least(0), "${profile.final_lr}")  # the learning rate at the end
-    # step: falls to final_lr at drop_at; cosine: falls to it along a half cosine
+    final_lr: float = setting(at_least(0), "${profile.final_lr}")  # the final learning rate
+    # step: the learning rate drops to final_lr at drop_at; cosine: it decays to final_lr along a half cosine
     schedule: str = setting(one_of("step", "cosine"), "${profile.schedule}")
-    drop_at: float = setting(within(0, 1, strict=True), 0.75)  # a fraction of the steps: 225 K of 300 K
-    # decay of an exponential moving average of the weights, such as 0.999, which is what counts; null for
-    # none
+    drop_at: float = setting(within(0, 1, strict=True), 0.75)  # as a fraction of the steps
+    # decay of an exponential moving average of the weights, such as 0.999; evaluation uses this average.
+    # null: no average
     ema: float | None = setting(within(0, 1, strict=True), "${profile.ema}")
 
 
@@ -82,9 +88,9 @@ class MuonSettings(AdamWSettings):
     Its steps are as long as AdamW's at the same learning rate.
     """
 
-    momentum: float = setting(fraction(), 0.95)  # Muon's
-    other_lr: float | None = setting(positive(), None)  # learning rate of all but matrices; null: lr
-    # which optimises parameters with one column or row, such as the biases of time mixes
+    momentum: float = setting(fraction(), 0.95)  # momentum of Muon
+    other_lr: float | None = setting(positive(), None)  # AdamW's learning rate; null: lr
+    # optimiser of parameters with only one column or row, such as the biases of time mixes
     vectors: str = setting(one_of("adamw", "muon"), "adamw")
 
 

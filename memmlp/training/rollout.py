@@ -77,8 +77,8 @@ class OwnPredictionsSettings(Settings):
     With memory.shift=frame a call predicts only one frame, so max_passes must be at least model.frames.
     """
 
-    # a step makes 0 to this many calls without gradient before the trained one; the number is drawn for each
-    # step
+    # maximum number of network calls without gradients before the trained call; each step draws the number of
+    # calls from 0 to this maximum
     max_passes: int = setting(at_least(1), 3)
 
 
@@ -118,7 +118,7 @@ class OwnPredictions(Rollout):
 class StreamsSettings(Settings):
     """Training on persistent streams (docs/readings.md, no. 6)."""
 
-    # streams side by side, each of which goes through whole clips on its own history
+    # number of parallel streams; each stream runs through whole clips with its own history
     streams: int = setting(at_least(1), tiny=16, small=1024, paper=1024)
 
 

@@ -66,10 +66,11 @@ class SAGEPartSettings:
     """The training of one of SAGE-Net's parts, by AdamW with a weight decay of 1e-4."""
 
     steps: int = setting(at_least(1), sized(20, 2000, 188000))
-    batch: int = setting(at_least(1), sized(8, 32, 512))  # windows a step
+    batch: int = setting(at_least(1), sized(8, 32, 512))  # number of windows per step
     lr: float = setting(positive(), sized(1.0e-3, 1.0e-3, 1.0e-4))
-    lr_drops_at: list[float] = setting(each(fraction(), empty=True), [0.75])  # fractions of the steps
-    lr_drop: float = setting(positive(), 0.25)  # by which the learning rate is multiplied at each of these
+    # when the learning rate drops, as fractions of the steps
+    lr_drops_at: list[float] = setting(each(fraction(), empty=True), [0.75])
+    lr_drop: float = setting(positive(), 0.25)  # factor of the learning rate at each drop
 
 
 @component("prerequisite", "sage", version=3)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import TINY
 
-from memmlp.cli.demo import fits_recurrent_poser, inactive_environment, next_steps
+from memmlp.cli.demo import describe_next_steps, find_inactive_environment, is_valid_for_recurrent_poser
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ def test_an_override_of_mem_mlps_slots_shows_it_alone(memmlp):
 
 def test_overrides_that_recurrent_poser_cannot_take_are_known_before_training():
     for words in (["profile=tiny", "threads=1"], ["vqvae.steps=7", "optim.steps=500"]):
-        assert fits_recurrent_poser(words)
+        assert is_valid_for_recurrent_poser(words)
     for words in (
         ["optim.steps=50"],  # shorter than its warm-up
         ["memory=none"],
@@ -44,7 +44,7 @@ def test_overrides_that_recurrent_poser_cannot_take_are_known_before_training():
         ["model=avatar_poser"],
         ["experiment=no_memory"],
     ):
-        assert not fits_recurrent_poser(words), words
+        assert not is_valid_for_recurrent_poser(words), words
 
 
 def test_next_steps_enter_the_environment_and_repeat_the_overrides(
@@ -56,13 +56,13 @@ def test_next_steps_enter_the_environment_and_repeat_the_overrides(
         (folder / "bin" / name).touch(mode=0o755)
     monkeypatch.setattr(sys, "prefix", str(folder))
     monkeypatch.setenv("PATH", "")
-    found = inactive_environment()
+    found = find_inactive_environment()
     assert found == folder
-    assert next_steps([], found).startswith(f"next: source {folder}/bin/activate\n")
-    first, imported, own = next_steps(["profile=tiny", "seed=1", "threads=1"]).splitlines()
+    assert describe_next_steps([], found).startswith(f"next: source {folder}/bin/activate\n")
+    first, imported, own = describe_next_steps(["profile=tiny", "seed=1", "threads=1"]).splitlines()
     assert first.startswith("next: memmlp train profile=tiny seed=1 threads=1 memory=none ")
     assert "memmlp data import" in imported
     data = ["data=mocap", "data.root=outputs/data/mine"]
     assert own.split() == ["memmlp", "train", "profile=tiny", "threads=1", *data]
     monkeypatch.setenv("PATH", str(folder / "bin"))
-    assert inactive_environment() is None
+    assert find_inactive_environment() is None

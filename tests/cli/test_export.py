@@ -17,7 +17,7 @@ from conftest import Memmlp, one_line
 from onnx import TensorProto
 
 from memmlp.cli import export as module
-from memmlp.cli.export import Form
+from memmlp.cli.export import ExportForm
 from memmlp.common.errors import InputError
 from memmlp.runs.lookup import is_trained, list_runs
 from memmlp.runs.run import Run
@@ -44,7 +44,7 @@ def test_an_offline_network_has_no_file():
     model = tiny.baseline("bodiffusion", offline=True, sampling_steps=2, depth=1)
     for graph in ("auto", "naive"):
         with pytest.raises(InputError, match=r"model\.offline=true"):
-            module.load(SimpleNamespace(network=lambda: model), Form(graph, "fp32", 18, None))
+            module.load(SimpleNamespace(network=lambda: model), ExportForm(graph, "fp32", 18, None))
 
 
 def the_run(home: Path) -> Run:
@@ -74,7 +74,7 @@ def test_a_deployed_file_is_copied_without_torch(home: Path, tmp_path: Path):
 def test_only_the_same_form_that_is_whole_is_copied(home: Path, tmp_path: Path):
     run, out = the_run(home), tmp_path / "step.onnx"
     deployed = run.preferred_deployment
-    record, fp32 = deployed.record, Form("auto", "fp32", 18, None)
+    record, fp32 = deployed.record, ExportForm("auto", "fp32", 18, None)
     for form in (fp32, fp32._replace(graph="streaming"), fp32._replace(precision="int8")):
         assert module.copy_deployed(run, out, form, 1e9), form
         out.unlink()
@@ -97,7 +97,7 @@ def test_a_run_in_fp16_for_unity(home: Path, tmp_path: Path, memmlp: Memmlp, mon
     whole = ["--scope", "full", "--space", "unity", "--rotations", "quaternion", "--opset", "15"]
     files, write = {}, module.write_graph
 
-    def kept(network: object, path: Path, run_id: str, form: Form) -> None:
+    def kept(network: object, path: Path, run_id: str, form: ExportForm) -> None:
         write(network, path, run_id, form)
         files[form.full] = copyfile(path, tmp_path / f"{len(files)}.onnx")
 

@@ -18,7 +18,7 @@ from conftest import Memmlp, one_line
 from glb import Glb
 from processes import PATIENCE, hearing_interrupts, started
 
-from memmlp.cli.live import LiveOptions, combine_calibration, load_clip
+from memmlp.cli.live import LiveOptions, combine_calibration, load_tracked_clip
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.live.stream import Stream
@@ -83,7 +83,7 @@ def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_p
     told.value = json.dumps(rest.tolist())
     onnx.save(model, tmp_path / "small.onnx")
     given = LiveOptions(str(tmp_path / "small.onnx"), tmp_path, clip=str(clip))
-    joints = load_clip(given).joints
+    joints = load_tracked_clip(given).joints
     for joint, parent in enumerate(PARENTS[1:], 1):
         bone = np.linalg.norm(joints[:, joint] - joints[:, parent], axis=-1)
         np.testing.assert_allclose(bone, np.linalg.norm(rest[joint] - rest[parent]), atol=1e-5)
@@ -92,7 +92,7 @@ def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_p
     copied.write_bytes(clip.read_bytes())
     write_json(tmp_path / "mine" / RECORD, body_record("builtin", builtin_rest_joints()))
     with pytest.raises(InputError, match=r"mine: .*builtin"):
-        load_clip(given._replace(clip=str(copied)))
+        load_tracked_clip(given._replace(clip=str(copied)))
 
 
 @pytest.mark.slow

@@ -105,9 +105,12 @@ def test_places_that_nothing_can_be_written_to_are_told_before_anything_is_measu
 def test_eval_says_that_code_has_changed_since(
     memmlp: Memmlp, finished: Run, monkeypatch: pytest.MonkeyPatch
 ):
-    assert "was made before the code" not in memmlp("eval", finished.id).out
+    assert "the code of" not in memmlp("eval", finished.id).out
     monkeypatch.setattr(Run, "changed_sources", property(lambda self: ["evaluation/metrics.py"]))
-    assert "was made before the code of evaluation/metrics.py changed" in memmlp("eval", finished.id).out
+    assert (
+        f"the code of evaluation/metrics.py has changed since run {finished.id}"
+        in memmlp("eval", finished.id).out
+    )
 
 
 def test_without_pyav_nothing_is_computed(memmlp: Memmlp, finished: Run, monkeypatch: pytest.MonkeyPatch):
@@ -132,7 +135,7 @@ def test_bad_input_to_live_is_one_line(memmlp: Memmlp, finished: Run, arguments,
 
 def test_a_file_has_no_test_clips(memmlp: Memmlp, finished: Run):
     assert one_line(
-        memmlp("live", str(finished.onnx), "--no-browser"), "has no test clips", "--clip FILE.npz"
+        memmlp("live", str(finished.onnx), "--no-browser"), "have no test clips", "--clip FILE.npz"
     )
     assert one_line(memmlp("live", "nothing.onnx", "--no-browser"), "nothing.onnx: no such file")
 

@@ -42,7 +42,7 @@ def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: p
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 130
-    assert "interrupted; the same command goes on from the last checkpoint" in capsys.readouterr().err
+    assert "interrupted; repeat the command to continue from the last checkpoint" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGTERM) == before
     seen: list[object] = []
     monkeypatch.setattr(
@@ -179,7 +179,7 @@ def test_a_bug_shows_where_it_is(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch
 
 def test_tracebacks_on_request(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MEMMLP_TRACEBACK", "1")
-    with pytest.raises(InputError, match="no such command"):
+    with pytest.raises(InputError, match="unknown command"):
         main(["trian"])
 
 

@@ -71,7 +71,7 @@ def test_check_names_the_page_that_differs(memmlp: Memmlp, planned: None):
     page.write_text(text.replace("inconclusive", "holds", 1))
     ran = memmlp("results", "docs", "--check")
     assert ran.code == 1
-    assert "differs: docs/results/table14.md" in ran.err
+    assert "docs/results/table14.md: differs" in ran.err
     memmlp("results", "docs")
     assert page.read_text() == text
 
@@ -109,7 +109,7 @@ def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None
         (["save", "10"], ("no finished run", "memmlp sweep table10")),
         (["save", "14", "optim.lr=1"], ("table14.json", "memmlp sweep table14 optim.lr=1", "--name")),
         (["save", "14", "--out", "/proc/no"], ("/proc/no",)),
-        (["show", "15"], ("data/15.json", "no such results", "table14")),
+        (["show", "15"], ("data/15.json", "no results with this name", "table14")),
         (["docs", "--folder", "elsewhere"], ("elsewhere/data", "--out elsewhere/data")),
     ],
 )

@@ -99,7 +99,7 @@ def test_seeds_go_where_verdicts_are_open(memmlp: Memmlp, runs: Runs):
     assert "analysis at 8 seeds (1.3 %): 4 of 4 comparisons decided" in ran.out
     assert "all verdicts are decided" in ran.out
     assert (
-        "19 runs were spent; 24 with 8 seeds for every variant, 39 with 13 seeds for every variant" in ran.out
+        "19 runs were done; without interim analyses: 24 with 8 seeds for every variant, 39 with" in ran.out
     )
     before = record()
     assert memmlp(*SWEEP).code == 0
@@ -116,13 +116,16 @@ def test_the_table_shows_the_rounds(memmlp: Memmlp, runs: Runs):
     assert out.count("3/3") == 2
     assert out.count("8/8") == 4
     chosen = " ".join(memmlp("table", "trial.yaml", "seed=0,1,2").out.split())
-    assert "seeds were spent in rounds with other seeds: these verdicts do not keep the 5 %" in chosen
+    assert (
+        "earlier interim analyses used other seeds, so the error rate of these verdicts can exceed 5 %"
+        in chosen
+    )
     branch = " ".join(memmlp("table", "trial.yaml", "--branch", "position").out.split())
-    assert "seeds were spent in rounds with other variants" in branch
+    assert "earlier interim analyses used other variants" in branch
     assert "higher (3)" not in branch
     runs.version = "of other data"
     other = " ".join(memmlp("table", "trial.yaml").out.split())
-    assert "seeds were spent in rounds, but not of these runs" in other
+    assert "earlier interim analyses do not apply" in other
 
 
 @pytest.mark.slow
@@ -147,7 +150,7 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
         (VARIANTS, {"seeds": [7]}, "seeds"),
     ):
         write(variants, **others)
-        line = f"rounds.json: its interim analyses were of other {word}; remove it"
+        line = f"rounds.json: the interim analyses in this file have other {word}; remove the file"
         assert one_line(memmlp(*SWEEP), line)
     write(VARIANTS)
     assert one_line(memmlp(*SWEEP, "--max-seeds", "8"), "--max-seeds 8: must be 13")
@@ -163,7 +166,7 @@ def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monk
     """A variant whose network diverged on every clip has no verdict."""
     monkeypatch.setitem(FACTORS, "same", float("nan"))
     out = memmlp(*SWEEP).out
-    assert "the runs have nothing to compare: same" in out
+    assert "there is nothing to compare: same" in out
     assert "all verdicts are decided" not in out
 
 
@@ -176,10 +179,13 @@ def test_kept_rounds_of_another_sweep_decide_nothing(memmlp: Memmlp, runs: Runs)
     memmlp(*SWEEP)
     memmlp("results", "save", "trial.yaml")
     assert memmlp("results", "docs").code == 0
-    assert "do not keep" not in page()
+    assert "exceed 5 %" not in page()
     write(VARIANTS, smallest={"MPJPE": 0.5})
     memmlp("results", "docs")
-    assert "seeds were spent in rounds with other smallest: these verdicts do not keep the 5 %" in page()
+    assert (
+        "earlier interim analyses used other smallest, so the error rate of these verdicts can exceed 5 %"
+        in page()
+    )
 
 
 @pytest.mark.slow
@@ -190,16 +196,19 @@ def test_what_is_kept_says_that_seeds_were_spent_in_rounds(memmlp: Memmlp, runs:
     memmlp("results", "save", "trial.yaml")
     assert one_line(memmlp("results", "save", "trial.yaml", "seed=0,1,2"), "trial.json", "seed 3")
     assert memmlp("results", "docs").code == 0
-    assert "do not keep" not in page()
+    assert "exceed 5 %" not in page()
     chosen = Path("docs/results/chosen.md").read_text()
-    assert "seeds were spent in rounds with other seeds: these verdicts do not keep the 5 %" in chosen
+    assert (
+        "earlier interim analyses used other seeds, so the error rate of these verdicts can exceed 5 %"
+        in chosen
+    )
 
 
 def test_one_group_of_clips_is_said(memmlp: Memmlp, runs: Runs):
     runs.groups = dict.fromkeys(CLIPS, "one take")
     out = memmlp(*SWEEP).out
     assert len(runs.made) == 9
-    assert "test clips are one group, or a network diverged on one: no number of seeds decides" in out
+    assert "all test clips form one group, or a network diverged on a clip" in out
 
 
 def test_inconclusive_verdicts_are_not_called_decided(memmlp: Memmlp, runs: Runs):
@@ -214,7 +223,7 @@ def test_failed_runs_are_late_and_made_up_for(memmlp: Memmlp, runs: Runs):
     runs.failing = {"worse"}
     ran = memmlp(*SWEEP)
     assert ran.code == 1
-    assert "again with: --retry" in ran.err
+    assert "repeat failed runs with --retry" in ran.err
     assert "all verdicts are decided" not in ran.out
     assert [labels for _, labels in analysed()] == [["same"]] * len(analysed())
     runs.failing = set()
@@ -225,7 +234,7 @@ def test_failed_runs_are_late_and_made_up_for(memmlp: Memmlp, runs: Runs):
 
 def test_status_and_dry_run_say_the_schedule(memmlp: Memmlp, runs: Runs):
     out = memmlp(*SWEEP, "--dry-run", "--max-seeds", "5", "--workers", "2").out
-    assert "analyses at 3 (1.7 %), 5 (3.3 %) seeds; together they spend 5 %" in out
+    assert "analyses at 3 (1.7 %), 5 (3.3 %) seeds, with a total error rate of 5 %" in out
     assert "9 of 9 runs to do, 2 at once" in out
     assert re.search(r"^same +0 +0 +3 +at 3$", out, re.M)
     assert not runs.made

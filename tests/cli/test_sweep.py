@@ -106,15 +106,15 @@ def test_variants_that_are_named_are_run_alone(home: Path):
         home, "--variant", "none", "--variant", "full"
     )  # the failure of another variant does not count
     assert "3 of 4 runs done" in said
-    assert "again with: --retry" in command(home, "--variant", "wild", code=1)
+    assert "repeat failed runs with --retry" in command(home, "--variant", "wild", code=1)
     assert stamps(home) == before
 
 
 def test_a_first_dry_run_counts_the_runs_whose_data_is_not_prepared(tmp_path: Path):
     (tmp_path / "trial.yaml").write_text("axes: {seed: [5, 6]}")
     said = command(tmp_path, "--dry-run", "--workers", "2")
-    assert "2 runs: their data is not prepared yet; the sweep does that first" in said
-    assert "2 of 2 runs to do, and the VQ-VAEs that they need, 2 at once" in said
+    assert "2 runs need data that is not prepared yet; the sweep prepares it first" in said
+    assert "2 of 2 runs to do, and VQ-VAEs that these runs need, 2 at once" in said
     assert not list_runs(tmp_path / "outputs")
 
 
@@ -226,7 +226,7 @@ BAD_INPUT: list[tuple[list[str], str]] = [
     (["trial.yaml", "--variant", "non"], "sweep trial: no variant 'non'"),
     (["trial.yaml", "--variant", "none", "--until-decided"], "--variant: "),
     (["trial.yaml", "executor=cloud"], "executor=cloud: "),
-    (["trial.yaml", "slurm.partition=x"], "slurm.partition: is for executor=slurm"),
+    (["trial.yaml", "slurm.partition=x"], "slurm.partition: needs executor=slurm"),
     (["trial.yaml", "executor=slurm", "slurm.nodes=2"], "slurm.nodes: "),
     (["trial.yaml", "executor=ray", "ray.gpus=1"], "ray.gpus: no such key"),
     (["trial.yaml", "executor=ray", "--gpus-per-worker", "1"], "--gpus-per-worker: "),

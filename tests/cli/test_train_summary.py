@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 from fake_runs import fake_run
 
-from memmlp.cli.train_summary import describe_latency, show, show_side_by_side, source_tables
+from memmlp.cli.train_summary import describe_latency, make_source_tables, show, show_side_by_side
 from memmlp.runs.evaluation_file import write_report
 from memmlp.training.request import Outcome
 
@@ -29,7 +29,7 @@ def test_tables_of_sources_are_of_the_evaluation_that_is_shown(tmp_path: Path):
     write_report(run.evaluation("stream-1"), report)
 
     def first(stage: str) -> list[float]:
-        return [float(next(iter(table.columns[2].cells))) for table in source_tables(run, [stage])]
+        return [float(next(iter(table.columns[2].cells))) for table in make_source_tables(run, [stage])]
 
     assert len(first("stream-0")) == 2
     for once, thrice in zip(first("stream-0"), first("stream-1"), strict=True):
@@ -68,19 +68,19 @@ def test_times_and_size_are_those_of_the_file_that_was_asked_for():
         "0.218 MMAC",
     ):
         assert words in said
-    assert "for 31% of the time" not in said
+    assert "available 31% of the time" not in said
 
 
 def test_an_int8_file_that_is_not_used_live_is_told():
     for jitter in (0.05, 0.356):
         cost = TIMES | {"onnx_bytes": 600_000, "growth": 0.0016, "jitter_growth": jitter}
         said = latency({"settings": {"precision": "int8"}, "int8": cost})
-        assert ("Jitter +35.6%" in said) == ("live use takes float32" in said) == (jitter > 0.1)
+        assert ("Jitter +35.6%" in said) == ("memmlp live uses float32" in said) == (jitter > 0.1)
 
 
 def test_times_of_a_busy_machine_say_so():
     for key in ("core_share", "alone_core_share", "pose_core_share"):
-        assert "for 31% of the time" in latency({key: 0.31})
+        assert "available 31% of the time" in latency({key: 0.31})
 
 
 def test_side_by_side_shows_each_branch_that_differs(capsys: pytest.CaptureFixture[str]):

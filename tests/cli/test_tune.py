@@ -89,10 +89,10 @@ BAD_SEARCHES = {
     "+search.space.optim.batch={low: -4, high: 8}": "search.space: optim.batch=-4: ",
     "optim.lr=-1": "memmlp: optim.lr=-1",
     "loss.rotation_all=5": "loss.rotation_all=5: is searched",
-    "+search.space.memory.blend={low: 0.0, high: 1.0}": "search.space: memory.blend: ",
+    "+search.space.memory.blend={low: 0.0, high: 1.0}": "search.space.memory.blend: ",
     "+search.space.data.split.seed={low: 0, high: 9}": "search.space: data.split.seed changes ",
     "+search.space.data={choices: [synth, mocap], first: synth}": "search.space: ",
-    "~search": "search: has no value",
+    "~search": "search: must be the name",
     "~search.n_trials": "search.n_trials: has no value",
     "+search.nonsense=1": "search.nonsense: no such key",
     "executor=cloud": "executor=cloud: ",
@@ -147,7 +147,7 @@ def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytes
         director.update(2)
 
     monkeypatch.setattr(director_module, "direct", replaced)
-    with pytest.raises(InputError, match="mine: its clips changed since the search started"):
+    with pytest.raises(InputError, match="mine: clips have changed since the search started"):
         search(setup, study, Workers())
     assert len(study.trials) == 1
 

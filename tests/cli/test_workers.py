@@ -36,8 +36,8 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, number):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     workers = Workers(**options)
-    assert workers.shares(wanted) == shares
-    assert workers.number(shares) == number
+    assert workers.make_gpu_shares(wanted) == shares
+    assert workers.count_workers(shares) == number
 
 
 @pytest.mark.parametrize(
@@ -53,12 +53,12 @@ def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, vis
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     with pytest.raises(InputError, match=line):
-        Workers(executor).shares([wanted])
+        Workers(executor).make_gpu_shares([wanted])
 
 
 @pytest.mark.parametrize("option", ["gpus_per_worker", "workers_per_gpu"])
 def test_options_of_local_workers_are_refused_elsewhere(option: str):
-    with pytest.raises(InputError, match=f"--{option.replace('_', '-')}: is for workers of this machine"):
+    with pytest.raises(InputError, match=f"--{option.replace('_', '-')}: needs workers of this machine"):
         Workers("ray", **{option: 1})
 
 
@@ -67,8 +67,8 @@ def test_words_of_an_executor_are_its_own(name: str):
     words = (f"executor={name}", f"{name}.address=head:1", f"{name}.resources.big=2", "seed=1")
     executor, own, rest = split_executor(words)
     assert (executor, rest) == (name, ("seed=1",))
-    assert Workers(executor, own).options() == {"address": "head:1", "resources": {"big": 2.0}}
-    with pytest.raises(InputError, match=f"{name}.address: is for executor={name}"):
+    assert Workers(executor, own).parse_options() == {"address": "head:1", "resources": {"big": 2.0}}
+    with pytest.raises(InputError, match=f"{name}.address: needs executor={name}"):
         split_executor(words[1:])
 
 

@@ -278,7 +278,7 @@ def test_an_executor_of_ones_own(folder: Path):
     assert (engine, words, rest) == ("mine.Mine", {"queue": "long"}, ("seed=1",))
     made = Workers(engine, words).start_executor(folder, [], gpus=False)
     assert made.given == (folder / "workers/%j", {"queue": "long"})  # type: ignore[attr-defined]
-    with pytest.raises(InputError, match=r"executor.queue: is for executor=PATH"):
+    with pytest.raises(InputError, match=r"executor.queue: needs executor=PATH"):
         split_executor(["executor.queue=long"])
 
 

@@ -14,7 +14,7 @@ from memmlp.cli.data.printing import (
     show_rates,
     show_skipped,
 )
-from memmlp.cli.options import PATH, Finite, body_option, format_option, strict_option
+from memmlp.cli.options import PATH, FiniteFloat, body_option, format_option, strict_option
 from memmlp.common.errors import InputError
 
 
@@ -30,7 +30,7 @@ data.add_command(verify)
 
 @data.command("synth")
 @click.option("--out", required=True, type=PATH, help="Folder for the clips.")
-@click.option("--minutes", default=10.0, show_default=True, help="Length of all clips together.")
+@click.option("--minutes", default=10.0, show_default=True, help="Total length of all clips.")
 @click.option("--seed", default=0, show_default=True)
 @click.option("--fps", default=60.0, show_default=True, help="Frame rate of the clips.")
 def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
@@ -41,20 +41,22 @@ def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
     from memmlp.motion.synthetic import synthesize
 
     if next(out.rglob("*.npz"), None):
-        raise InputError(f"--out {out}: has clips already; expected a new folder, or one without npz")
+        raise InputError(f"--out {out}: already has clips; expected a folder without npz files")
     paths = synthesize(out, minutes=minutes, seed=seed, fps=fps)
     click.echo(f"{len(paths)} clips, {minutes:g} minutes, in {out}")
 
 
 @data.command("show")
 @click.argument("source", type=PATH)
-@click.option("--out", required=True, type=PATH, help="The sheet, a .png.")
-@click.option("--clips", default=12, show_default=True, type=click.IntRange(1, 200), help="Clips at most.")
+@click.option("--out", required=True, type=PATH, help="PNG file to write.")
+@click.option(
+    "--clips", default=12, show_default=True, type=click.IntRange(1, 200), help="Maximum number of clips."
+)
 @body_option
 def show(source: Path, out: Path, clips: int, body: str) -> None:
-    """Draw clips of a folder of npz files, or one clip, each at three moments.
+    """Draw clips, each at three moments.
 
-    The clips are spread evenly over the folder's files in the order of their names.
+    SOURCE is an npz file or a folder of npz files. The clips are evenly spaced in the sorted list of files.
     """
     from memmlp.common.files import atomic_write
     from memmlp.report.pictures.clip_pictures import check_picture_path
@@ -71,13 +73,12 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
 @data.command("prepare")
 @click.argument("root", type=PATH)
 @click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
-@click.option("--out", required=True, type=PATH, help="Folder of the cache.")
+@click.option("--out", required=True, type=PATH, help="Folder for the cache.")
 def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
-    """Write the cache of a folder of AMASS npz.
+    """Prepare a folder of AMASS npz files as a memory-mappable cache for custom code.
 
-    The cache is memory-mappable, and has a manifest with the outcome for each file. It is for custom code:
-    memmlp train makes its own cache of data.root. The overrides are those of memmlp train; the default is
-    data=mocap.
+    The cache's manifest has the outcome for each file. `memmlp train` does not need this command, because it
+    makes its own cache of data.root. The overrides are those of `memmlp train`; the default is data=mocap.
     """
     from omegaconf import OmegaConf
 
@@ -94,9 +95,9 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
 @data.command("inspect")
 @click.argument("path", type=PATH)
 def inspect(path: Path) -> None:
-    """Show clips, hours, rates and bad files.
+    """Show clips, hours, frame rates and bad files.
 
-    PATH is a cache or a folder of npz files. For a cache, the command also shows the splits.
+    PATH is a cache or a folder of npz files. For a cache, the command also shows the split.
     """
     from memmlp.motion.preparing.manifest import MANIFEST, Manifest, Total
     from memmlp.motion.preparing.survey import survey
@@ -107,7 +108,7 @@ def inspect(path: Path) -> None:
     content = survey(path)
     show_skipped(content.skipped)
     show_pairs("unusual", content.unusual, ": ")
-    show_pairs("the same frames, or some of them", content.duplicates)
+    show_pairs("some or all frames are the same", content.duplicates)
     show_rates(content.clips)
     hours = Total(len(content.clips), sum(clip.length for clip in content.clips)).hours
     click.echo(f"{len(content.clips)} clips, {hours:.2f} h, {len(content.skipped)} bad files")
@@ -115,16 +116,23 @@ def inspect(path: Path) -> None:
 
 @data.command("export")
 @click.argument("source", type=PATH)
-@click.option("--out", required=True, type=PATH, help="A file for a file, a folder for a folder.")
+@click.option(
+    "--out",
+    required=True,
+    type=PATH,
+    help="File to write if SOURCE is a file, or folder if SOURCE is a folder.",
+)
 @format_option
 @body_option
-@click.option("--fps", type=Finite(1, 1000), metavar="HZ", help="Resample the clips.  [default: their rate]")
+@click.option(
+    "--fps", type=FiniteFloat(1, 1000), metavar="HZ", help="Frame rate to resample to.  [default: unchanged]"
+)
 @strict_option
 def export(source: Path, out: Path, format_: str | None, body: str, fps: float | None, strict: bool) -> None:
-    """Write AMASS npz as BVH or glTF.
+    """Convert AMASS npz files to BVH or glTF, or to another frame rate.
 
-    SOURCE is an npz file or a folder of npz files. BVH is in centimetres, glTF in metres, both with Y up; npz
-    (AMASS' layout, hands at rest) is for another frame rate.
+    SOURCE is an npz file or a folder of npz files. BVH is in centimetres and glTF in metres, both with Y up.
+    The output format npz has AMASS' layout, with the hands at rest.
     """
     from memmlp.motion.exporting import export as export_clips
     from memmlp.motion.exporting import plan_export

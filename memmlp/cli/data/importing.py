@@ -1,4 +1,4 @@
-"""`memmlp data import`, `verify` and `skeleton`: clips from files of other skeletons."""
+"""`memmlp data import`, `verify` and `skeleton`: import clips with other skeletons."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.data.printing import amount, show_skipped, show_some
+from memmlp.cli.data.printing import describe_amount, show_skipped, show_some
 from memmlp.cli.options import PATH, body_option, strict_option
 from memmlp.common.errors import InputError
 
 skeleton_option = click.option(
-    "--skeleton", help="A shipped skeleton map or the path of one.  [default: by the joints' names]"
+    "--skeleton",
+    help="Name of a shipped skeleton map, or path of a map.  [default: detected from the joint names]",
 )
 up_option = click.option(
-    "--up", type=click.Choice(["y", "z"]), help="The files' up axis; by default the map's."
+    "--up", type=click.Choice(["y", "z"]), help="Up axis of the files.  [default: from the map]"
 )
 
 
@@ -25,13 +26,19 @@ up_option = click.option(
 @click.argument("source", type=PATH)
 @click.option("--out", required=True, type=PATH, help="Folder for the npz files.")
 @skeleton_option
-@click.option("--fps", multiple=True, metavar="[FOLDER=]HZ", help="True frame rate, for all or one folder.")
+@click.option(
+    "--fps",
+    multiple=True,
+    metavar="[FOLDER=]HZ",
+    help="Actual frame rate of all files or of one folder; repeatable.",
+)
 @click.option(
     "--floor",
     default="auto",
     show_default=True,
     metavar="auto|none|METRES",
-    help="auto puts the lowest stable contact of the feet at 0; METRES is the floor's height in the files.",
+    help="Floor height in the files. auto: the height of the lowest stable foot contact; none: heights are "
+    "unchanged.",
 )
 @up_option
 @body_option
@@ -48,15 +55,15 @@ def import_(
     strict: bool,
     sound: bool,
 ) -> None:
-    """Import BVH and ASF/AMC files as AMASS npz.
+    """Import BVH and ASF/AMC files as AMASS npz files.
 
-    SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
-    file; faults are reported.
+    SOURCE is a folder or one file. Each clip is converted to the 22-joint tree and compared with its file.
+    The command reports faults.
     """
     from memmlp.config.plugins import grouping_to_choose
     from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
-    settings = ImportSettings(skeleton, _rates(fps), body, _floor(floor), strict, sound, up)
+    settings = ImportSettings(skeleton, _parse_rates(fps), body, _parse_floor(floor), strict, sound, up)
     report = import_folder(source, out, settings)
     for note in report.notes:
         click.echo(f"note: {note}")
@@ -65,18 +72,18 @@ def import_(
     show_some(faulty, "clips with warnings")
     seconds = sum(clip.frames / clip.fps for clip in report.clips)
     maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
-    click.echo(f"{amount(len(report.clips), seconds)}, skeleton {maps}, in {out}")
+    click.echo(f"{describe_amount(len(report.clips), seconds)}, skeleton {maps}, in {out}")
     grouping = grouping_to_choose([Path(clip.clip).with_suffix("").as_posix() for clip in report.clips])
     group_overrides = [f"data/grouping@data.split={grouping}"] if grouping else []
     click.echo("next: " + shlex.join(["memmlp", "train", "data=mocap", f"data.root={out}", *group_overrides]))
 
 
-def _rates(texts: Sequence[str]) -> dict[str, float]:
+def _parse_rates(texts: Sequence[str]) -> dict[str, float]:
     rates: dict[str, float] = {}
     for text in texts:
         folder, _, rate = text.rpartition("=")
         if folder in rates:
-            raise InputError(f"--fps {text}: a second rate for {folder or 'all'}; expected one")
+            raise InputError(f"--fps {text}: a second rate for {folder or 'all files'}; expected only one")
         try:
             rates[folder] = float(rate)
         except ValueError:
@@ -84,7 +91,7 @@ def _rates(texts: Sequence[str]) -> dict[str, float]:
     return rates
 
 
-def _floor(text: str) -> str | float:
+def _parse_floor(text: str) -> str | float:
     if text in ("auto", "none"):
         return text
     try:
@@ -101,14 +108,14 @@ def _floor(text: str) -> str | float:
 @skeleton_option
 @body_option
 @up_option
-@click.option("--all", "show_all", is_flag=True, help="Show every file and not only those with faults.")
+@click.option("--all", "show_all", is_flag=True, help="Show every file, not only files with faults.")
 def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_all: bool) -> None:
-    """Check imports against the files themselves.
+    """Compare imported clips with the files.
 
-    Each file is imported, and the result is compared with the file's own joints. The worst values are the
-    largest distance of a mapped joint on the file's own bones, and the largest angle between a segment
-    (trunk, neck, arms, legs, feet) on the body and in the file. Impossible postures and lengths are faults.
-    Continues after bad files; exits with 1 if any file has a fault or can't be imported.
+    The command imports each file and compares the result with the file's joints. It prints the largest
+    position error of a mapped joint, on the file's bone lengths, and the largest angle error of a segment
+    (trunk, neck, arms, legs, feet). Impossible postures and lengths are faults. The command continues after
+    bad files. It exits with 1 if a file has a fault or cannot be imported.
     """
     from memmlp.motion.clip import Skipped
     from memmlp.motion.importing.import_folder import ImportSettings, verify_folder
@@ -135,17 +142,17 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_a
 
 @click.group("skeleton")
 def skeleton() -> None:
-    """Propose a map for an unknown skeleton, and show a map's result for a file."""
+    """Propose a map for an unknown skeleton, or draw a map's result for a file."""
 
 
 @skeleton.command("guess")
 @click.argument("file", type=PATH)
-@click.option("--out", type=PATH, help="Also write the map there; an existing file is not replaced.")
+@click.option("--out", type=PATH, help="New file to write the map to.")
 def guess(file: Path, out: Path | None) -> None:
-    """Propose a map for a file, from its joints' names and its tree.
+    """Propose a skeleton map for a file, based on its joint names and tree.
 
-    Prints the map with comments that mark guesses and missing joints, imports the file with it, and prints
-    the faults of the result. Exits with 1 if the file can't be imported with it.
+    The command prints the map, in which comments mark guesses and missing joints. Then it imports the file
+    with the map and prints faults. It exits with 1 if the import fails.
     """
     from memmlp.motion.importing.guess import as_yaml, check, write_map
     from memmlp.motion.importing.guess import guess as guess_map
@@ -173,11 +180,11 @@ def guess(file: Path, out: Path | None) -> None:
 @skeleton.command("show")
 @click.argument("file", type=PATH)
 @skeleton_option
-@click.option("--out", required=True, type=PATH, help="The picture, a .png.")
+@click.option("--out", required=True, type=PATH, help="PNG file to write.")
 def show(file: Path, skeleton: str | None, out: Path) -> None:
-    """Draw the stance that a file's skeleton is read from, with the nodes that a map picks.
+    """Draw a file's reference pose with the nodes that a skeleton map selects.
 
-    The picture also has the built-in body in the same stance. If the two differ, the map is wrong.
+    The picture also shows the built-in body in the same pose. If the two poses differ, the map is wrong.
     """
     from memmlp.motion.body import load_rest_joints
     from memmlp.motion.importing.convert import view_stance

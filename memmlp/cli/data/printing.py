@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from memmlp.motion.exporting import ExportReport
     from memmlp.motion.preparing.manifest import ClipRecord, Manifest
 
-MOST_NAMED = 8  # skipped files that are named on the screen; the manifest lists all
+MAX_NAMES = 8  # maximum number of skipped files to print; the manifest lists all files
 
 
 def show_manifest(manifest: Manifest) -> None:
-    """Print the parts, frame rates and skipped files of a cache, and remarks on its split."""
+    """Print the split, frame rates and skipped files of a cache, and warnings about its split."""
     table = Table("part")
     for name in ("clips", "frames", "hours"):
         table.add_column(name, justify="right")
@@ -44,7 +44,7 @@ def show_manifest(manifest: Manifest) -> None:
     show_rates(manifest.clips, manifest.interpolation)
     show_skipped(manifest.skipped)
     show_pairs("unusual", manifest.unusual, ": ")
-    show_pairs("left out, since another part has the same frames or some of them", manifest.duplicates)
+    show_pairs("left out because another part contains some of its frames", manifest.duplicates)
     left_out = sum(manifest.left_out.values())
     click.echo(
         f"{len(manifest.clips)} clips; skipped {len(manifest.skipped)}, left out by the split {left_out}, "
@@ -72,7 +72,7 @@ def show_persons(manifest: Manifest) -> None:
 
 
 def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:
-    """Print the frame rates of clips, and how each was brought to 60 Hz; with the interpolation, if given."""
+    """Print the frame rates of clips and their conversions to 60 Hz, with the interpolation if given."""
     for (fps, method), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
         detail = f" by {interpolation}" if interpolation and method == INTERPOLATED else ""
         click.echo(f"{count} clips at {fps:g} Hz: {method}{detail}")
@@ -92,20 +92,20 @@ def show_skipped(skipped: Sequence[Skipped]) -> None:
 
 def show_some(lines: list[str], label: str) -> None:
     """Print the first few lines, and the number of further ones."""
-    for line in lines[:MOST_NAMED]:
+    for line in lines[:MAX_NAMES]:
         click.echo(line)
-    if len(lines) > MOST_NAMED:
-        click.echo(f"{len(lines) - MOST_NAMED} more {label}")
+    if len(lines) > MAX_NAMES:
+        click.echo(f"{len(lines) - MAX_NAMES} more {label}")
 
 
 def show_exported(report: ExportReport, out: Path) -> None:
-    """Print the skipped and odd clips of an export, and how much it wrote."""
+    """Print the skipped and unusual clips of an export, and the number and length of the written clips."""
     show_skipped(report.skipped)
     show_pairs("unusual", report.unusual, ": ")
-    click.echo(f"{amount(len(report.written), report.seconds)}, in {out}")
+    click.echo(f"{describe_amount(len(report.written), report.seconds)}, in {out}")
 
 
-def amount(clips: int, seconds: float) -> str:
+def describe_amount(clips: int, seconds: float) -> str:
     """Describe a number of clips and their total length."""
     length = f"{seconds / 60:.1f} minutes" if seconds >= 60 else f"{seconds:.1f} seconds"
     return f"{clips} clip{'s' * (clips != 1)}, {length}"

@@ -13,7 +13,15 @@ from rich.console import Console
 from rich.table import Table
 
 from memmlp.cli.options import outputs_option
-from memmlp.cli.runs.show import SHORT, age, console, outdated_results, plain_table, record_of, value_text
+from memmlp.cli.runs.show import (
+    ID_LENGTH,
+    format_age,
+    format_value,
+    list_outdated_results,
+    make_console,
+    make_plain_table,
+    read_record,
+)
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import describe_kind
@@ -22,38 +30,43 @@ if TYPE_CHECKING:
     from memmlp.runs.query import Record
     from memmlp.runs.run import Run
 
-NEWEST = 20
-RESULTS = {
-    # the column's head -> the key of its number
+MAX_RUNS = 20
+RESULT_COLUMNS = {
+    # column header -> key of the number
     "MPJPE\nstream": "stream.rotation.MPJPE",
     "MPJPE\nwindow": "window.rotation.MPJPE",
     "Jitter\nstream": "stream.rotation.Jitter",
     "ms": "latency.median_ms",
 }
-LEGEND = f"MPJPE [{UNITS['MPJPE']}], Jitter [{UNITS['Jitter']}]: rotation branch; ms: a frame on one core"
-EXPENDABLE = ("ms", "age", "Jitter\nstream", "MPJPE\nwindow")  # left out first on a narrow screen
-KEYS = 4  # differing keys that have columns, if nobody asked for them
-NAMED = 4  # keys without a column that are named below the table
-NAME = 31  # characters of a run's name in a line, at least
+LEGEND = (
+    f"MPJPE [{UNITS['MPJPE']}], Jitter [{UNITS['Jitter']}]: rotation branch; ms: time per frame on one core"
+)
+REMOVABLE_COLUMNS = ("ms", "age", "Jitter\nstream", "MPJPE\nwindow")  # in this order on a narrow screen
+MAX_COLUMNS = 4  # maximum number of columns for differing keys, without --columns
+MAX_NAMED_KEYS = 4  # maximum number of keys without a column to print below the table
+NAME_WIDTH = 31  # minimum width of the column of names, in characters
 
 
 @click.command("list")
 @click.option(
-    "--all", "every", is_flag=True, help=f"List all: VQ-VAEs and parts too, and more than {NEWEST}."
+    "--all",
+    "every",
+    is_flag=True,
+    help=f"List all runs: more than {MAX_RUNS}, including VQ-VAEs and network parts.",
 )
+@click.option("--where", help="Condition for runs to list, such as 'memory=gru and stream.MPJPE<6.3'.")
+@click.option("--sort", help="Key to sort by, such as stream.MPJPE; -KEY sorts in descending order.")
 @click.option(
-    "--where", help="List the runs that fulfil a condition, such as 'memory=gru and stream.MPJPE<6.3'."
+    "--columns", help="Comma-separated keys to show.  [default: config keys that differ between runs]"
 )
-@click.option("--sort", help="Sort by a key, such as stream.MPJPE; -KEY begins with the largest.")
-@click.option("--columns", help="Show these keys, separated by commas.  [default: config keys that differ]")
 @outputs_option
 def list_runs(every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path) -> None:
-    """List the runs, the newest first; finished runs of VQ-VAEs and of networks' parts are hidden (--all).
+    """List the runs, newest first. Without --all, finished VQ-VAEs and network parts are hidden.
 
-    Shown are their names and data, the config keys that differ, the MPJPE of the rotation branch in both
-    modes, Jitter, and the latency of a frame. Keys are those of the config (`memory`, `optim.lr`), results
-    (`stream.MPJPE`, `window.position.Jitter`, `latency.median_ms`), and `id`, `kind`, `status`, `name`,
-    `data`, `started`, `tag`, `note`.
+    The columns are name, data, differing config keys, the rotation branch's MPJPE in both modes, Jitter, and
+    latency per frame. KEY is a config key (`memory`, `optim.lr`), a result (`stream.MPJPE`,
+    `window.position.Jitter`, `latency.median_ms`), or `id`, `kind`, `status`, `name`, `data`, `started`,
+    `tag`, `note`.
     """
     from memmlp.runs import lookup
     from memmlp.runs.query import parse_query
@@ -61,70 +74,70 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     query = parse_query(where) if where else None
     runs = lookup.list_runs(outputs)
     if not runs:
-        hint = "memmlp demo makes the first; --outputs FOLDER or MEMMLP_OUTPUTS names another folder"
+        hint = "memmlp demo creates one; --outputs FOLDER or MEMMLP_OUTPUTS selects another folder"
         click.echo(f"no runs in {outputs.absolute() / 'runs'}: {hint}")
         return
     found = runs if every or query else [run for run in runs if not _is_finished_part(run)]
-    newest = found if every or query or sort else found[:NEWEST]
-    records = {run.id: record_of(run) for run in newest}
+    newest = found if every or query or sort else found[:MAX_RUNS]
+    records = {run.id: read_record(run) for run in newest}
     fits = query.test_records(list(records.values())) if query else [True] * len(records)
     listed = [run for run, fit in zip(newest, fits, strict=True) if fit]
     if sort:
-        listed = _sorted_by(listed, records, sort)
-    keys = _chosen_keys(columns, records, listed)
-    rows = [{**records[run.id], "age": age(run)} for run in listed]
+        listed = _sort_runs(listed, records, sort)
+    keys = _choose_keys(columns, records, listed)
+    rows = [{**records[run.id], "age": format_age(run)} for run in listed]
     hidden = _print_table(rows, keys, asked=columns is not None)
-    for line in (*_outdated_lines(listed), *_hardly_trained_lines(listed)):
+    for line in (*_describe_outdated_results(listed), *_describe_hardly_trained(listed)):
         click.echo(line)
     if hidden:
-        more = f" and {len(hidden) - NAMED} more keys" if len(hidden) > NAMED else ""
-        option = ",".join(["name", *hidden[:NAMED], "stream.MPJPE"])
-        click.echo(f"they also differ in {', '.join(hidden[:NAMED])}{more}: --columns {option}")
+        more = f" and {len(hidden) - MAX_NAMED_KEYS} more keys" if len(hidden) > MAX_NAMED_KEYS else ""
+        option = ",".join(["name", *hidden[:MAX_NAMED_KEYS], "stream.MPJPE"])
+        click.echo(f"they also differ in {', '.join(hidden[:MAX_NAMED_KEYS])}{more}: --columns {option}")
     if parts := Counter(describe_kind(run.manifest["kind"]) for run in runs if run not in found):
         counts = ", ".join(f"{count} finished {word}" for word, count in parts.items())
         click.echo(f"{counts}: memmlp runs list --all")
     if len(found) > len(newest):
-        click.echo(f"{len(found) - len(newest)} older ones: memmlp runs list --all")
+        click.echo(f"{len(found) - len(newest)} older runs: memmlp runs list --all")
     elif query:
         click.echo(f"{len(listed)} of {len(found)} runs")
 
 
-def _outdated_lines(listed: Sequence[Run]) -> list[str]:
-    """Return a line for each mode in which runs were measured by an earlier component version."""
+def _describe_outdated_results(listed: Sequence[Run]) -> list[str]:
+    """Return a line for each mode with results of an earlier component version."""
     found: dict[tuple[str, str], list[str]] = {}
     for run in listed:
-        for results in outdated_results(run).items():
-            found.setdefault(results, []).append(run.id[:SHORT])
+        for results in list_outdated_results(run).items():
+            found.setdefault(results, []).append(run.id[:ID_LENGTH])
     return [
-        f"{results} {by}; memmlp eval RUN measures them again: {_join(ids)}"
+        f"{results} {by}; measure again with memmlp eval RUN: {_join_ids(ids)}"
         for (results, by), ids in found.items()
     ]
 
 
-def _hardly_trained_lines(listed: Sequence[Run]) -> list[str]:
-    """Return a line that names the finished runs whose networks hardly saw motion, if there are any."""
+def _describe_hardly_trained(listed: Sequence[Run]) -> list[str]:
+    """Return a line with the finished runs that had too little training; no line without such runs."""
     from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
 
     networks = [run for run in listed if run.manifest.get("kind") == NETWORK and run.done]
-    ids = [run.id[:SHORT] for run in networks if warn_if_hardly_trained(count_training_frames(run))]
+    ids = [run.id[:ID_LENGTH] for run in networks if warn_if_hardly_trained(count_training_frames(run))]
     if not ids:
         return []
-    names = "all finished runs" if len(ids) == len(networks) > 1 else _join(ids)
+    names = "all finished runs" if len(ids) == len(networks) > 1 else _join_ids(ids)
     return [f"hardly trained, ignore the errors: {names}"]
 
 
-def _join(ids: Sequence[str]) -> str:
-    more = f" and {len(ids) - NEWEST} more" if len(ids) > NEWEST else ""
-    return ", ".join(ids[:NEWEST]) + more
+def _join_ids(ids: Sequence[str]) -> str:
+    more = f" and {len(ids) - MAX_RUNS} more" if len(ids) > MAX_RUNS else ""
+    return ", ".join(ids[:MAX_RUNS]) + more
 
 
 def _is_finished_part(run: Run) -> bool:
-    """Return whether a run is a finished VQ-VAE or part of a network, which does not have results to list."""
+    """Return whether a run is a finished VQ-VAE or network part, which has no results to list."""
     return run.manifest.get("kind") not in (None, NETWORK) and run.done
 
 
-def _sorted_by(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:
-    """Return the runs sorted by a key; those without such a value, or with NaN, come last."""
+def _sort_runs(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:
+    """Return the runs sorted by a key. Runs with a missing or NaN value come last."""
     from memmlp.runs.query import check_key
 
     key, reverse = sort.removeprefix("-"), sort.startswith("-")
@@ -140,8 +153,8 @@ def _is_nan(value: object) -> bool:
     return isinstance(value, float) and math.isnan(value)
 
 
-def _chosen_keys(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:
-    """Return the keys to show: those asked for, or those of the config that differ between finished runs."""
+def _choose_keys(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:
+    """Return the keys to show: those of --columns, or config keys that differ between finished runs."""
     from memmlp.runs.query import check_key, list_differing_keys
 
     if columns is not None:
@@ -158,22 +171,22 @@ def _print_table(records: Sequence[Record], keys: Sequence[str], asked: bool) ->
     """Print the runs as a table, and return the keys that did not fit.
 
     Args:
-        records: the values that can be shown of each run, and its `age`.
-        keys: the keys whose values are shown.
-        asked: whether the user asked for these keys, so that all of them are shown, without results.
+        records: the record of each run, with its `age`.
+        keys: the keys to show.
+        asked: whether --columns set the keys; then all of them are shown, without results.
     """
-    columns = _columns(records, keys, asked)
-    expendable = ["age"] if asked else [*EXPENDABLE, *reversed(keys[:KEYS])]
+    columns = _make_columns(records, keys, asked)
+    removable = ["age"] if asked else [*REMOVABLE_COLUMNS, *reversed(keys[:MAX_COLUMNS])]
     wide = Console(width=10_000)
-    while (width := wide.measure(_table(columns, asked)).minimum) > console().width and expendable:
-        columns.pop(expendable.pop(0), None)
-    shown = Console(highlight=False, markup=False, width=max(console().width, width))
-    shown.print(_table(columns, asked))
+    while (width := wide.measure(_make_table(columns, asked)).minimum) > make_console().width and removable:
+        columns.pop(removable.pop(0), None)
+    shown = Console(highlight=False, markup=False, width=max(make_console().width, width))
+    shown.print(_make_table(columns, asked))
     return [key for key in keys if key not in columns]
 
 
-def _columns(records: Sequence[Record], keys: Sequence[str], asked: bool) -> dict[str, list[str]]:
-    """Return the texts of all columns by their heads."""
+def _make_columns(records: Sequence[Record], keys: Sequence[str], asked: bool) -> dict[str, list[str]]:
+    """Return the cells of all columns by header."""
     from memmlp.runs.query import label_data
 
     columns = {"run": [one["id"] for one in records]}
@@ -183,29 +196,31 @@ def _columns(records: Sequence[Record], keys: Sequence[str], asked: bool) -> dic
         columns["name"] = [str(one.get("name") or "-") for one in records]
         if len(set(labels) - {"-"}) > 1:
             columns["data"] = labels
-    for key in keys if asked else keys[:KEYS]:
-        values = labels if key == "data" else [value_text(one, key, whole=asked) for one in records]
+    for key in keys if asked else keys[:MAX_COLUMNS]:
+        values = labels if key == "data" else [format_value(one, key, whole=asked) for one in records]
         columns[key] = list(values)
     if any(one.get("tag") for one in records):
         columns["tags"] = ["\n".join(one.get("tag", ())) for one in records]
     if not asked:
-        columns |= {head: [shown_number(one, key) for one in records] for head, key in RESULTS.items()}
+        columns |= {
+            head: [format_number(one, key) for one in records] for head, key in RESULT_COLUMNS.items()
+        }
     return columns
 
 
-def _table(columns: Mapping[str, Sequence[str]], asked: bool) -> Table:
-    """Make the table of some columns, in which only names are wrapped."""
-    table = plain_table()
+def _make_table(columns: Mapping[str, Sequence[str]], asked: bool) -> Table:
+    """Make a table of columns in which only names wrap."""
+    table = make_plain_table()
     table.padding, table.show_edge = (0, 0), False
     table.caption_justify, table.caption_style = "left", ""
     table.caption = None if asked else LEGEND
     for head in columns:
-        is_name, is_number = head == "name" and not asked, head in RESULTS and not asked
+        is_name, is_number = head == "name" and not asked, head in RESULT_COLUMNS and not asked
         table.add_column(
             head,
             justify="right" if is_number else "left",
             no_wrap=not is_name,
-            min_width=NAME if is_name else None,
+            min_width=NAME_WIDTH if is_name else None,
             overflow="fold",
         )
     for cells in zip(*columns.values(), strict=True):
@@ -213,8 +228,8 @@ def _table(columns: Mapping[str, Sequence[str]], asked: bool) -> Table:
     return table
 
 
-def shown_number(record: Record, key: str) -> str:
-    """Return a number as text; a time of another file than the config asks for with that file's name."""
+def format_number(record: Record, key: str) -> str:
+    """Format a number; a time also names the measured file if it is not the file that the config requests."""
     group, _, name = key.partition(".")
     others = (other for other in record if other.startswith(f"{group}-") and other.partition(".")[2] == name)
     shown = key if key in record else next(others, None)

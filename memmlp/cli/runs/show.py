@@ -1,4 +1,4 @@
-"""`memmlp runs show` and `memmlp runs diff`, and what the commands of runs share."""
+"""`memmlp runs show` and `memmlp runs diff`, and helpers for the other commands of `memmlp runs`."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from memmlp.runs.query import Record
     from memmlp.runs.run import Run
 
-SHORT = 8  # characters of a shortened id
-MAX_LENGTH = 36  # characters of a shortened value
-SUMMARY = ("kind", "started", "finished")
-HIDDEN = (
+ID_LENGTH = 8  # number of characters of a shortened id
+MAX_VALUE_LENGTH = 36  # maximum number of characters of a value
+SUMMARY_KEYS = ("kind", "started", "finished")
+HIDDEN_KEYS = (
     "id", "name", "data", "prerequisite", "prerequisite_runs", "sources",
-    "source_bytes", "attempts", "forgiven", "stages", *SUMMARY,
+    "source_bytes", "attempts", "forgiven", "stages", *SUMMARY_KEYS,
 )  # fmt: skip
-ORIGIN = (
+ORIGIN_KEYS = (
     "device", "gpu", "threads", "processes", "precision", "version", "git", "python", "packages",
     "component_versions",
 )  # fmt: skip
@@ -36,12 +36,12 @@ ORIGIN = (
 
 @click.command("show")
 @click.argument("run")
-@click.option("--config", "config", is_flag=True, help="Print the run's resolved config, too.")
+@click.option("--config", "config", is_flag=True, help="Also print the run's resolved config.")
 @outputs_option
 def show(run: str, config: bool, outputs: Path) -> None:
     """Show one run and its results.
 
-    RUN is its id, the beginning of it, or its folder.
+    RUN is an id, the beginning of an id, or a folder.
     """
     from memmlp.report.tables.measured_run import load_measured_run
     from memmlp.runs.evaluation_file import name_solvers
@@ -49,28 +49,28 @@ def show(run: str, config: bool, outputs: Path) -> None:
     from memmlp.runs.lookup import find_run, is_trained
 
     found = find_run(outputs, run)
-    console().print(_pairs(_summary(found)))
+    make_console().print(_make_pair_table(_summarize_run(found)))
     if is_trained(found):
         for source, measured in load_measured_run(found.folder).split_by_source().items():
             means = name_solvers(measured.means, found.evaluations_as_configured.combined_solvers)
-            console().print(_pairs(flatten(means), title=f"results on {source}"))
+            make_console().print(_make_pair_table(flatten(means), title=f"results on {source}"))
     if found.results:
-        console().print(_pairs(measured_numbers(found), title="results"))
-    origin = {key: value for key, value in found.manifest.items() if key not in HIDDEN}
+        make_console().print(_make_pair_table(collect_measured_numbers(found), title="results"))
+    origin = {key: value for key, value in found.manifest.items() if key not in HIDDEN_KEYS}
     components = {"component_versions": origin.pop("component_versions", {})}
-    console().print(_pairs(flatten(origin | components), title="made by"))
+    make_console().print(_make_pair_table(flatten(origin | components), title="made by"))
     if config and found.config:
-        console().print(_pairs(flatten(found.config), title="config"))
+        make_console().print(_make_pair_table(flatten(found.config), title="config"))
 
 
-def _summary(run: Run) -> dict[str, Any]:
-    """Return what a run is, and its progress."""
-    values, manifest = record_of(run), run.manifest
+def _summarize_run(run: Run) -> dict[str, Any]:
+    """Return the facts about a run and its progress."""
+    values, manifest = read_record(run), run.manifest
     facts = {"run": run.id, "name": values.get("name"), "folder": run.folder, "status": run.status}
     if failure := run.failure:
         facts["failed with"] = failure
-    facts |= {key: manifest[key] for key in SUMMARY if key in manifest}
-    digest = str(values.get("data_digest", ""))[:SHORT]
+    facts |= {key: manifest[key] for key in SUMMARY_KEYS if key in manifest}
+    digest = str(values.get("data_digest", ""))[:ID_LENGTH]
     facts["data"] = " ".join(dict.fromkeys([str(values.get("data", "-")), digest]))
     if prerequisite := manifest.get("prerequisite"):
         facts["needs run"] = prerequisite
@@ -81,7 +81,7 @@ def _summary(run: Run) -> dict[str, Any]:
     ]
     if attempts:
         facts["attempts"] = "\n".join(attempts)
-    facts |= outdated_results(run)
+    facts |= list_outdated_results(run)
     if changed := run.verify():
         facts["changed since"] = ", ".join(changed)
     return facts
@@ -94,60 +94,60 @@ def _summary(run: Run) -> dict[str, Any]:
 def diff(a: str, b: str, outputs: Path) -> None:
     """Show how two runs differ.
 
-    Compared are the config keys that affect results, the data, the results, and code and machine. The change
-    is B minus A.
+    The command compares config keys that affect results, data, results, code and machine. Changes are B
+    minus A.
     """
     from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
 
     pair = first, second = find_run(outputs, a), find_run(outputs, b)
-    ids, short = [run.id for run in pair], [run.id[:SHORT] for run in pair]
-    if rows := _config_differences(first, second):
-        _print_rows(plain_table("config", *ids), rows, wrapped=slice(1, None))
+    ids, short = [run.id for run in pair], [run.id[:ID_LENGTH] for run in pair]
+    if rows := _list_config_differences(first, second):
+        _print_rows(make_plain_table("config", *ids), rows, wrapped=slice(1, None))
     else:
         click.echo("config: no difference")
-    if rows := result_differences(first, second):
-        _print_rows(plain_table("results", *short, "change", "unit"), rows, wrapped=slice(1))
-        click.echo("one run of each: such changes may be chance; memmlp sweep compares over seeds")
+    if rows := list_result_differences(first, second):
+        _print_rows(make_plain_table("results", *short, "change", "unit"), rows, wrapped=slice(1))
+        click.echo("such changes can be chance; memmlp sweep compares several seeds")
     else:
         click.echo("results: no difference")
     for run in pair:
         if remark := warn_if_hardly_trained(count_training_frames(run)):
-            click.echo(f"run {run.id[:SHORT]}: {remark}")
+            click.echo(f"run {run.id[:ID_LENGTH]}: {remark}")
     data = [run.manifest.get("data") for run in pair]
     if all(data) and data[0] != data[1]:
-        click.echo("their data differ, so their errors are on different test clips")
-    if rows := _origin_differences(first, second):
-        _print_rows(plain_table("made by", *ids), rows, wrapped=slice(None))
+        click.echo("the runs' data differ, so their errors are for different test clips")
+    if rows := _list_origin_differences(first, second):
+        _print_rows(make_plain_table("made by", *ids), rows, wrapped=slice(None))
 
 
 def _print_rows(table: Table, rows: list[tuple[str, ...]], wrapped: slice) -> None:
-    """Print a table in which only some columns may be wrapped: a number in two lines is misread."""
+    """Print a table in which only the columns of the slice `wrapped` can wrap, because numbers must not."""
     for column in table.columns:
         column.no_wrap = column not in table.columns[wrapped]
     for row in rows:
         table.add_row(*row)
-    console().print(table)
+    make_console().print(table)
 
 
-def _config_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for each differing key of the config, or the data, that changes a result."""
+def _list_config_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
+    """Return a row for each difference of config keys or data that affects results."""
     from memmlp.runs.query import label_data, list_differing_keys
 
-    pair = [record_of(run) for run in (first, second)]
+    pair = [read_record(run) for run in (first, second)]
     digests = [str(one.get("data_digest")) for one in pair]
     keys = list_differing_keys([run.config for run in (first, second)], digests)
-    rows = [(key, *(value_text(one, key) for one in pair)) for key in keys]
+    rows = [(key, *(format_value(one, key) for one in pair)) for key in keys]
     return rows if len(set(digests)) == 1 else [("data", *label_data(pair)), *rows]
 
 
-def result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for each measured number that differs: its key, both values, the change, and its unit."""
-    a, b = measured_numbers(first), measured_numbers(second)
+def list_result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
+    """Return a row for each measured number that differs: key, both values, change and unit."""
+    a, b = collect_measured_numbers(first), collect_measured_numbers(second)
     return [
         (
             key,
-            _text(a.get(key)),
-            _text(b.get(key)),
+            _format_cell(a.get(key)),
+            _format_cell(b.get(key)),
             f"{b[key] - a[key]:+.4g}" if key in a and key in b else "-",
             UNITS.get(key.rpartition(".")[2], "ms" if key.endswith("_ms") else ""),
         )
@@ -156,25 +156,28 @@ def result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
     ]
 
 
-def _origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for every difference in code and machine that may change numbers despite equal configs."""
+def _list_origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
+    """Return a row for each difference in code or machine, which can affect results of equal configs."""
     from memmlp.runs.deployment_folder import describe_timing_machine
     from memmlp.runs.identity import flatten
 
     a, b = (
-        flatten({key: run.manifest.get(key) for key in ORIGIN})
-        | {"latency": describe_timing_machine(run.deployment_as_configured.record), **outdated_results(run)}
+        flatten({key: run.manifest.get(key) for key in ORIGIN_KEYS})
+        | {
+            "latency": describe_timing_machine(run.deployment_as_configured.record),
+            **list_outdated_results(run),
+        }
         for run in (first, second)
     )
     return [
-        (key, _text(a.get(key)), _text(b.get(key)))
+        (key, _format_cell(a.get(key)), _format_cell(b.get(key)))
         for key in a | b
         if a.get(key) != b.get(key) and (not key.startswith("component_versions.") or (key in a and key in b))
     ]
 
 
-def record_of(run: Run) -> Record:
-    """Return a run's record of values; of a run with a damaged file, only its id and status."""
+def read_record(run: Run) -> Record:
+    """Return a run's record of values. For a run with a damaged file, it has only the id and status."""
     from memmlp.runs.query import build_record
 
     try:
@@ -184,16 +187,16 @@ def record_of(run: Run) -> Record:
         return {"id": run.id, "status": "damaged"}
 
 
-def value_text(record: Record, key: str, whole: bool = False) -> str:
-    """Return a record's value as text; a long one is shortened unless the whole is wanted."""
+def format_value(record: Record, key: str, whole: bool = False) -> str:
+    """Format a record's value; a long text is shortened unless `whole` is set."""
     from memmlp.runs.query import format_typed_value
 
     text = format_typed_value(record[key]) if key in record else "-"
-    return text if whole or len(text) <= MAX_LENGTH else f"{text[:MAX_LENGTH]}…"
+    return text if whole or len(text) <= MAX_VALUE_LENGTH else f"{text[:MAX_VALUE_LENGTH]}…"
 
 
-def measured_numbers(run: Run) -> dict[str, Any]:
-    """Return the numbers in a run's results by dotted key, with the names of inverse kinematics in these."""
+def collect_measured_numbers(run: Run) -> dict[str, Any]:
+    """Return the numbers in a run's results by dotted key; the keys include the inverse kinematics' name."""
     from memmlp.runs.deployment_folder import replace_with_deployed_times
     from memmlp.runs.evaluation_file import name_solvers
     from memmlp.runs.identity import flatten
@@ -206,44 +209,44 @@ def measured_numbers(run: Run) -> dict[str, Any]:
     }
 
 
-def outdated_results(run: Run) -> dict[str, str]:
-    """Return which of a run's results were measured by earlier component versions; none for a damaged run."""
+def list_outdated_results(run: Run) -> dict[str, str]:
+    """Return the results that earlier component versions measured; an empty dict for a damaged run."""
     try:
         outdated = run.evaluations_as_configured.outdated
-    except InputError:  # `record_of` reports it
+    except InputError:  # `read_record` reports it
         return {}
     return {f"{mode} results": f"by an earlier version: {changes}" for mode, changes in outdated.items()}
 
 
-def console() -> Console:
-    """Make a console that prints texts unchanged."""
+def make_console() -> Console:
+    """Make a console that prints text unchanged."""
     return Console(highlight=False, markup=False)
 
 
-def plain_table(*columns: str, title: str | None = None) -> Table:
-    """Make a table without a border; long values are wrapped, and no word is cut."""
+def make_plain_table(*columns: str, title: str | None = None) -> Table:
+    """Make a table without a border. Long values are wrapped, not cut."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
     for column in columns:
         table.add_column(column, overflow="fold")
     return table
 
 
-def _pairs(facts: Mapping[str, Any], title: str | None = None) -> Table:
+def _make_pair_table(facts: Mapping[str, Any], title: str | None = None) -> Table:
     """Make a table of keys and values."""
-    table = plain_table("", "", title=title)
+    table = make_plain_table("", "", title=title)
     table.show_header = False
     for key, value in facts.items():
-        table.add_row(key, _text(value))
+        table.add_row(key, _format_cell(value))
     return table
 
 
-def _text(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return "-" if value is None else str(value)
 
 
-def age(run: Run) -> str:
+def format_age(run: Run) -> str:
     """Return the time since the run started, in its largest whole unit."""
     try:
         started = datetime.fromisoformat(run.manifest.get("started", ""))

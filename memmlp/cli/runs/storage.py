@@ -6,20 +6,20 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import PATH, Finite, outputs_option
-from memmlp.cli.runs.show import age, console, plain_table
+from memmlp.cli.options import PATH, FiniteFloat, outputs_option
+from memmlp.cli.runs.show import format_age, make_console, make_plain_table
 
 
 @click.command("tag")
 @click.argument("run")
 @click.argument("tags", nargs=-1, required=True)
-@click.option("--remove", is_flag=True, help="Remove the tags instead.")
+@click.option("--remove", is_flag=True, help="Remove the tags instead of adding them.")
 @outputs_option
 def tag(run: str, tags: tuple[str, ...], remove: bool, outputs: Path) -> None:
-    """Give a run tags.
+    """Add tags to a run.
 
-    They lie in its folder, and do not change its id. `memmlp runs list --where tag=WORD` finds them, and
-    `memmlp runs gc` keeps runs with tags.
+    Tags are stored in the run's folder and do not change its id. `memmlp runs list --where tag=WORD` lists
+    tagged runs, and `memmlp runs gc` does not delete them.
     """
     from memmlp.runs.lookup import add_tags, find_run, remove_tags
 
@@ -33,9 +33,9 @@ def tag(run: str, tags: tuple[str, ...], remove: bool, outputs: Path) -> None:
 @click.argument("text", required=False)
 @outputs_option
 def note(run: str, text: str | None, outputs: Path) -> None:
-    """Replace a run's note by TEXT, or print it.
+    """Replace a run's note by TEXT, or print the note.
 
-    An empty TEXT removes it.
+    An empty TEXT removes the note.
     """
     from memmlp.runs.lookup import find_run, read_notes, set_note
 
@@ -50,15 +50,16 @@ def note(run: str, text: str | None, outputs: Path) -> None:
     "kinds",
     multiple=True,
     type=click.Choice(["failed", "old", "orphaned"]),
-    help="Delete only these; may be repeated.  [default: all three]",
+    help="Delete only this kind of runs; repeatable.  [default: all three kinds]",
 )
-@click.option("--yes", is_flag=True, help="Delete them. Without it they are only shown.")
+@click.option("--yes", is_flag=True, help="Delete the runs. Without --yes they are only listed.")
 @outputs_option
 def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
-    """Show, or delete, runs that are not needed.
+    """List, or delete, runs that are not needed.
 
-    These are failed runs, runs with older component versions, and orphans: a VQ-VAE that no run uses, or a
-    folder without a run. Runs with a tag or a note, runs in progress, and runs that other runs need are kept.
+    These are failed runs, runs with older component versions, and orphans. An orphan is a VQ-VAE that no run
+    uses, or a folder without a run. Runs with a tag or a note, runs in progress, and prerequisite runs of
+    other runs are kept.
     """
     from memmlp.runs.garbage_runs import REASONS, delete, find_garbage
 
@@ -66,10 +67,10 @@ def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
     if not found:
         click.echo("nothing to delete")
         return
-    table = plain_table("run", "kind", "reason", "age", "MB")
+    table = make_plain_table("run", "kind", "reason", "age", "MB")
     for one in found:
-        table.add_row(one.run.id, one.kind, one.reason, age(one.run), f"{one.size / 1e6:.1f}")
-    console().print(table)
+        table.add_row(one.run.id, one.kind, one.reason, format_age(one.run), f"{one.size / 1e6:.1f}")
+    make_console().print(table)
     if not yes:
         size = sum(one.size for one in found) / 1e6
         click.echo(f"{len(found)} runs, {size:.1f} MB; delete them with --yes")
@@ -78,17 +79,17 @@ def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
     click.echo(f"deleted {len(deleted)} runs, {sum(one.size for one in deleted) / 1e6:.1f} MB")
     for one in found:
         if one not in deleted:
-            click.echo(f"run {one.run.id} is kept: it is in use, or has a tag or a note", err=True)
+            click.echo(f"run {one.run.id} is not deleted: it is in use, or has a tag or a note", err=True)
 
 
 @click.command("export")
 @click.argument("run")
-@click.option("--out", type=PATH, help="The file.  [default: RUN.memmlp.zip in this folder]")
+@click.option("--out", type=PATH, help="File to write.  [default: RUN.memmlp.zip in this folder]")
 @outputs_option
 def export(run: str, out: Path | None, outputs: Path) -> None:
     """Write a finished run to one file, which another machine can import.
 
-    It contains the run's config, manifest, weights, results, tags and note, but no checkpoint.
+    The file contains the run's config, manifest, weights, results, tags and note, but no checkpoint.
     """
     from memmlp.runs.archive import export_run
     from memmlp.runs.lookup import find_run
@@ -102,16 +103,20 @@ def export(run: str, out: Path | None, outputs: Path) -> None:
 
 @click.command("import")
 @click.argument("path", type=PATH)
-@click.option("--sha256", help="The digest that `memmlp runs export` printed.  [default: any]")
+@click.option("--sha256", help="Expected digest, as printed by `memmlp runs export`.  [default: any]")
 @click.option(
-    "--max-gb", type=Finite(0, min_open=True), default=4.0, show_default=True, help="Largest allowed size."
+    "--max-gb",
+    type=FiniteFloat(0, min_open=True),
+    default=4.0,
+    show_default=True,
+    help="Maximum size in GB.",
 )
 @outputs_option
 def import_(path: Path, sha256: str | None, max_gb: float, outputs: Path) -> None:
-    """Add the run in a file that `memmlp runs export` wrote.
+    """Import a run from a file that `memmlp runs export` wrote.
 
-    A file is refused if a digest in it is wrong. --sha256 proves that it is the file that was exported. A run
-    that exists already is not changed, even if the file has more of its evaluations and deployments.
+    The command rejects a file with a wrong digest inside. --sha256 verifies that the file is the exported
+    one. An existing run is not changed, even if the file has additional evaluations or deployments.
     """
     from memmlp.runs.archive import import_run
 

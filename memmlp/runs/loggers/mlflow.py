@@ -42,7 +42,7 @@ class MLflowSettings(Settings):
     It needs pip install 'memmlp[mlflow]'.
     """
 
-    uri: str | None = setting(default=None)  # null: MLFLOW_TRACKING_URI, or else sqlite under paths.outputs
+    uri: str | None = setting(default=None)  # null: MLFLOW_TRACKING_URI if set, or SQLite in paths.outputs
 
 
 @dataclass(frozen=True)

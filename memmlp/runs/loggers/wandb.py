@@ -25,7 +25,7 @@ FINGERPRINT = "memmlp-fingerprint"
 class WandBSettings(Settings):
     """Writes runs as W&B offline runs to outputs/wandb (needs pip install 'memmlp[wandb]')."""
 
-    project: str = setting(text(), "memmlp")  # to which `wandb sync` uploads
+    project: str = setting(text(), "memmlp")  # the project that `wandb sync` uploads to
 
 
 @dataclass(frozen=True)

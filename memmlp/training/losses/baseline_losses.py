@@ -33,8 +33,8 @@ ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {
 class AGRoLLossSettings(CompleteLossSettings):
     """AGRoL's loss (Du et al. 2023); Mem-MLP can use it with predictor=rotation_only and hand=off."""
 
-    # norm: the mean over frames and joints of the 6D error's norm, as in the released code; square: the mean
-    # squared error
+    # norm: mean norm of the 6D error over frames and joints, as in the released code; square: mean squared
+    # error
     error: str = setting(one_of("norm", "square"), "norm")
 
     rotations_alone: ClassVar[bool] = True
@@ -64,12 +64,11 @@ class AGRoLLoss(Loss):
 class AvatarPoserLossSettings(CompleteLossSettings):
     """AvatarPoser's loss: mean absolute errors (Jiang et al. 2022)."""
 
-    # weight of the root's orientation: the released code's; its paper has 0.05
+    # weight of the root's orientation; 0.02 as in the released code, while the paper has 0.05
     orientation: float = setting(at_least(0), 0.02)
     rotation: float = setting(at_least(0), 1.0)  # weight of the local rotations
-    position: float = setting(at_least(0), 1.0)  # weight of the positions by forward kinematics
-    # where both bodies coincide: pelvis, as in the released code, or head, with the predicted head on its
-    # tracker
+    position: float = setting(at_least(0), 1.0)  # weight of the joint positions from forward kinematics
+    # the joint at which both bodies are aligned: pelvis, as in the released code, or head, at its tracker
     anchor: str = setting(one_of("pelvis", "head"), "pelvis")
 
 

@@ -48,7 +48,7 @@ class UncertaintySettings(Settings):
     A term counts as e^-s L + s, with one learned s for each term.
     """
 
-    # the learning rate of every s; with the network's own they would not settle
+    # learning rate of every s; with the network's learning rate, s would not converge
     lr: float = setting(positive(), 1.0e-2)
 
 

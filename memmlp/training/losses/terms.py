@@ -203,38 +203,38 @@ class TermsLossSettings(CompleteLossSettings):
     need several frames.
     """
 
-    # of differences: absolute components, square, norm (of joints), smooth (Huber's, as torch's smooth L1)
+    # measure of differences: absolute and square of components, norm of joints, or smooth (torch's smooth L1)
     error: str = setting(one_of("absolute", "square", "norm", "smooth"), "absolute")
-    # learned: by uncertainty (Eq. 5), as e^-s L + s with one s for each term; the weights are those that e^-s
-    # begins at
+    # learned: weights by uncertainty (Eq. 5), e^-s L + s, with one s for each term; the weights below are the
+    # initial values of e^-s
     weighting: str = setting(one_of("fixed", "learned"), "fixed")
-    lr: float = setting(positive(), 1.0e-2)  # the learning rate of every s, where weights are learned
+    lr: float = setting(positive(), 1.0e-2)  # learning rate of every s with weighting=learned
     orientation: float | None = setting(at_least(0), None)  # the root's 6D orientation
     rotation: float | None = setting(at_least(0), 1.0)  # the other joints' local 6D rotations
     global_rotation: float | None = setting(at_least(0), None)  # all joints' global 6D rotations
-    # the angle between global rotations, radians, whatever `error` is
+    # the angle between global rotations, in radians; ignores `error`
     angle: float | None = setting(at_least(0), None)
-    # all local 6D rotations' differences from frame to frame
+    # the differences of all local 6D rotations between consecutive frames
     sixd_velocity: float | None = setting(at_least(0), None)
-    # velocity on SO(3): the rotations from frame to frame, as 6D
+    # velocity on SO(3): the relative rotations between consecutive frames, in 6D
     turn: float | None = setting(at_least(0), None)
-    # joints by forward kinematics relative to the pelvis: without translation
+    # joint positions from forward kinematics, relative to the pelvis, so without translation
     position_from_pelvis: float | None = setting(at_least(0), None)
-    # joints by forward kinematics with the head on its tracker
+    # joint positions from forward kinematics, with the head at its tracker
     world_position: float | None = setting(at_least(0), None)
-    hand: float | None = setting(at_least(0), None)  # both wrists, with the head on its tracker
-    # the joints' movement from frame to frame, with the head on its tracker
+    hand: float | None = setting(at_least(0), None)  # positions of both wrists, with the head at its tracker
+    # the joints' movement between consecutive frames, with the head at its tracker
     velocity: float | None = setting(at_least(0), None)
-    velocity_3: float | None = setting(at_least(0), None)  # the same between every third frame
-    velocity_5: float | None = setting(at_least(0), None)  # the same between every fifth frame
-    acceleration: float | None = setting(at_least(0), None)  # the joints' second differences
-    # the norm of the predicted joints' third differences, whatever the true ones are
+    velocity_3: float | None = setting(at_least(0), None)  # the joints' movement over three frames
+    velocity_5: float | None = setting(at_least(0), None)  # the joints' movement over five frames
+    acceleration: float | None = setting(at_least(0), None)  # the second differences of the joints
+    # the norm of the third differences of the predicted joints; does not depend on the true joints
     jerk: float | None = setting(at_least(0), None)
-    # the movement of predicted feet while the true ones move at most 1 cm a frame
+    # the movement of the predicted feet while the true feet move at most 1 cm per frame
     contact: float | None = setting(at_least(0), None)
-    # how far the lowest joint is below the lowest true joint of the window
+    # the depth of the lowest predicted joint below the lowest true joint of the window
     penetration: float | None = setting(at_least(0), None)
-    # the distance of predicted toes from that height while the true ones stand
+    # the distance of the predicted toes from the lowest true joint's height while the true toes stand still
     foot_height: float | None = setting(at_least(0), None)
 
     rotations_alone: ClassVar[bool] = True
