@@ -144,7 +144,7 @@ def test_help_of_train_lists_what_can_be_chosen_and_nothing_else(memmlp: Memmlp)
         (["runs", "shwo"], ["shwo"]),
         (["runs", "show"], ["RUN", "memmlp runs show --help"]),
         (["runs", "list", "--nope"], ["--nope", "memmlp runs list --help"]),
-        (["runs", "show", "zz"], ["run 'zz'", "no such folder"]),
+        (["runs", "show", "zz"], ["run 'zz'", "a run's folder"]),
     ],
 )
 def test_bad_usage_is_one_line(memmlp: Memmlp, arguments: list[str], words: list[str]):
