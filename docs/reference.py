@@ -25,7 +25,7 @@ from memmlp.cli.main import COMMANDS, commands
 from memmlp.common.components import collect_attribute, find_component, list_component_names
 from memmlp.common.settings import MISSING
 from memmlp.config.component_source import GROUPS
-from memmlp.config.plugins import packaged
+from memmlp.config.plugins import find_packaged_folder
 from memmlp.config.schema import ONLY, SCHEMAS
 
 ROOT = Path(__file__).parent.parent
@@ -104,7 +104,7 @@ class Key(typing.NamedTuple):
 
 def config_page() -> str:
     """All groups, their options and keys."""
-    conf = packaged("conf")
+    conf = find_packaged_folder("conf")
     defaults = default_options(conf / "train.yaml")
     parts = [
         "# Config keys",

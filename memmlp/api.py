@@ -200,11 +200,11 @@ class TrainedRun(os.PathLike[str]):
         Raises:
             InputError: for another clip or mode, or if the run's data is missing or has changed.
         """
-        from memmlp.config.open_run import clip_of
+        from memmlp.config.open_run import find_clip
         from memmlp.evaluation.predictions import predict_clip
 
         _check("mode", mode, get_args(Mode))
-        arrays = predict_clip(self.model, clip_of(self._opened.test, clip, "clip"), mode)
+        arrays = predict_clip(self.model, find_clip(self._opened.test, clip, "clip"), mode)
         learned = "position" in self.model.branches
         return Prediction(
             run=self.id,
@@ -238,9 +238,9 @@ class TrainedRun(os.PathLike[str]):
 
     @cached_property
     def _opened(self) -> OpenedRun:
-        from memmlp.config.open_run import open_found
+        from memmlp.config.open_run import open_existing_run
 
-        return open_found(self._run)
+        return open_existing_run(self._run)
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         measured, combined_by = load_measured_run(self.folder), self.combined_by

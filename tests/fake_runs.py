@@ -90,7 +90,7 @@ def fake_sweep(
             config={"overrides": list(variant.overrides or ())},
             **settings,
         )
-        for variant in sweep.runnable()
+        for variant in sweep.list_runnable()
         for seed in sweep.seeds
     }
 

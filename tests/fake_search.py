@@ -55,8 +55,8 @@ def log(run: Run, step: int, value: float) -> None:
 
 def finish(plan: Plan) -> None:
     """Bring the runs of a plan to their end."""
-    for task in plan.left():
-        run = plan.run_of(task)
+    for task in plan.list_remaining():
+        run = plan.get_run(task)
         run.begin("memmlp", task.config, data="d", prerequisite=None)
         log(run, STEPS, error(task.config))
         run.finish([])
@@ -71,7 +71,7 @@ def to_the_end(study: Study, folder: Path, capacity: int = 2) -> None:
 def begun(plan: Plan) -> Run:
     """Begin the run of a plan's only task, and return it."""
     (task,) = plan.tasks
-    run = plan.run_of(task)
+    run = plan.get_run(task)
     run.begin("memmlp", task.config, data="d", prerequisite=None)
     return run
 

@@ -110,4 +110,4 @@ def test_a_custom_package_is_found_by_its_entry_point(bin_folder: Path, tmp_path
     assert table["rows"][0]["cells"]["stream"]["FootSkate"]["mean"] > 0
     run(*pip, "uninstall", "--yes", PACKAGE, folder=home)
     said = run(command, "eval", manifest["id"], folder=home, code=2)
-    assert said.startswith(f"memmlp: run {manifest['id']}: made with the package {PACKAGE} 0.1.0")
+    assert said.startswith(f"memmlp: run {manifest['id']}: needs the package {PACKAGE} 0.1.0")

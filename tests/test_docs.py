@@ -22,8 +22,8 @@ from own_package import PACKAGE, registers_kept
 from memmlp.cli.main import COMMANDS, commands
 from memmlp.cli.workers import Workers, split_executor
 from memmlp.common.components import list_component_names as component_names
-from memmlp.config.build import untrained
-from memmlp.config.compose import compose_plain, composed, parse, preflight
+from memmlp.config.build import build_untrained
+from memmlp.config.compose import compose_config, compose_jobs, compose_plain, parse_hydra_arguments
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.plugins import activate
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
@@ -182,9 +182,9 @@ COMPOSED: set[tuple[str, ...]] = set()
 def compose_once(overrides: Sequence[str]) -> None:
     """Compose and check the config of every job of `memmlp train OVERRIDES`."""
     if tuple(overrides) not in COMPOSED:
-        args = parse(list(overrides))
+        args = parse_hydra_arguments(list(overrides))
         if not args.help and not args.shell_completion:
-            preflight(args)
+            compose_jobs(args)
             COMPOSED.add(tuple(overrides))
 
 
@@ -196,7 +196,7 @@ def compose_sweep(values: dict[str, Any]) -> None:
     if name.isupper() or name == "all" or name.endswith(".yaml"):  # a reader's, or many
         compose_once([word for word in rest if not word.startswith("seed=")])
         return
-    variants = find_sweep(name).with_overrides(rest).variant_seeds()
+    variants = find_sweep(name).with_overrides(rest).list_variant_seeds()
     for one in (variants[0], variants[-1]):
         compose_once(one.overrides)
 
@@ -207,7 +207,7 @@ def compose_search(overrides: Sequence[str]) -> None:
     own = [word for word in words if word.lstrip("+~").startswith("search")]
     search = parse_search(compose_plain("tune", own)["search"])
     rest = [word for word in words if word not in own]
-    compose_once([*search.base, *rest, *search.overrides(next(iter(search.first_trials()), {}))])
+    compose_once([*search.base, *rest, *search.overrides(next(iter(search.list_first_trials()), {}))])
 
 
 BOTH_SOURCES = (
@@ -295,7 +295,7 @@ def test_the_reference_has_every_key_and_option(reference: ModuleType):
     page = reference.config_page()
     memories = [f"memory={name}" for name in component_names("memory")]
     for word in (*memories, "model=agrol_diffusion", "model=avatar_poser", "loss=manual", "rollout=streams"):
-        values = flatten(OmegaConf.to_container(composed([word]), resolve=False)).items()
+        values = flatten(OmegaConf.to_container(compose_config([word]), resolve=False)).items()
         for key in {key for key, value in values if f"## {key}\n" not in page or value not in (None, {})}:
             assert key.rsplit(".", 1)[-1] == "name" or f"| `{key}` |" in page, f"{word}: {key}"
     page = reference.command_page()
@@ -315,18 +315,18 @@ def test_examples_of_the_guides_work(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.syspath_prepend(tmp_path)
     with registers_kept():
         words = ["plugins=[mine]", "profile=tiny", "--config-dir", str(tmp_path / "myconf")]
-        cfg = composed([*words, "model=wide_conv"])
+        cfg = compose_config([*words, "model=wide_conv"])
         assert (cfg.model.name, cfg.model.width, cfg.loss.name) == ("causal_conv", 512, "terms")
         assert "mine" not in sys.modules
         names: dict[str, Any] = {}
         exec(test, names)
         names["test_the_stream_is_the_network"]()
-        assert untrained([*words, "model=causal_conv"]).count_parameters() > 0
+        assert build_untrained([*words, "model=causal_conv"]).count_parameters() > 0
     (tmp_path / "mine.yaml").write_text(examples("sweeps", "yaml")[0])
     sweep = load_sweep(tmp_path / "mine.yaml")
     assert sweep.control == "2, 4, 6, 8"
-    for one in sweep.variant_seeds():
-        composed(one.overrides)
+    for one in sweep.list_variant_seeds():
+        compose_config(one.overrides)
     skeleton = yaml.safe_load(examples("motion", "yaml")[0])
     assert set(skeleton) == set(SkeletonMap.__dataclass_fields__)
 

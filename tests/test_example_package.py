@@ -51,6 +51,4 @@ def test_every_command_takes_custom_components(
     monkeypatch.setenv("PYTHONPATH", ":".join(path for path in paths if path != str(EXAMPLE)))
     ran = finished([*MAIN, "eval", made.id], cwd=tmp_path)
     assert ran.returncode == 2
-    assert ran.stderr.startswith(
-        f"memmlp: run {made.id}: made with the package {PACKAGE} 0.1.0, which is not"
-    )
+    assert ran.stderr.startswith(f"memmlp: run {made.id}: needs the package {PACKAGE} 0.1.0, which was not")

@@ -85,7 +85,7 @@ def export_all(
     import torch
 
     from memmlp.common.progress import progress_bar
-    from memmlp.config.build import untrained
+    from memmlp.config.build import build_untrained
     from memmlp.deploy.export import export
     from memmlp.deploy.latency import strip_conversions
     from memmlp.deploy.lower_precision import write_lower_precision
@@ -96,7 +96,7 @@ def export_all(
     for name in progress_bar(models, "exporting"):
         option, _, frames = name.partition("@")
         size = (f"model.frames={frames}",) if frames else ()
-        model = untrained(("profile=paper", *overrides, f"model={option}", *size))
+        model = build_untrained(("profile=paper", *overrides, f"model={option}", *size))
         files = {graph: folder / f"{name}.{graph}.onnx" for graph in GRAPHS}
         export(strip_conversions(model), files["network"], "random")
         export(model, files["naive"], "random")

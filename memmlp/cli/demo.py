@@ -50,12 +50,12 @@ def demo(overrides: tuple[str, ...]) -> None:
 def is_valid_for_recurrent_poser(overrides: Sequence[str]) -> bool:
     """Return whether a demo's overrides do not choose a network and are valid for RecurrentPoser, too."""
     from memmlp.common.errors import InputError
-    from memmlp.config.compose import parse, preflight
+    from memmlp.config.compose import compose_jobs, parse_hydra_arguments
 
     if any(word.startswith(("model=", "experiment=", "-")) for word in overrides):
         return False
     try:
-        preflight(parse(["data=synth", "profile=small", *overrides, RECURRENT_POSER]))
+        compose_jobs(parse_hydra_arguments(["data=synth", "profile=small", *overrides, RECURRENT_POSER]))
     except InputError:
         return False
     return True

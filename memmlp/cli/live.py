@@ -226,10 +226,10 @@ def load_tracked_clip(options: LiveOptions) -> TrackedClip:
         )
     if sys.stderr.isatty():  # it takes seconds
         print_note(f"opening run {options.network} and its test clips")
-    from memmlp.config.open_run import clip_index, open_run
+    from memmlp.config.open_run import find_clip_index, open_run
 
     test = open_run(options.outputs, options.network).test
-    index = 0 if options.clip is None else clip_index(test, options.clip)
+    index = 0 if options.clip is None else find_clip_index(test, options.clip)
     return TrackedClip(test.names[index], test.clip(index).numpy())
 
 

@@ -64,25 +64,25 @@ def predict(
     """
     check_runs_exist(outputs, run)
     from memmlp.cli.data.printing import show_exported
-    from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
+    from memmlp.config.open_run import OpenedRun, build_run_experiment, load_network, load_run_data
     from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.body import check_imported_body
     from memmlp.motion.exporting import plan_export
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
-    experiment = experiment_of(found, device, [] if ik is None else [f"evaluation.ik={ik}"])
+    experiment = build_run_experiment(found, device, [] if ik is None else [f"evaluation.ik={ik}"])
     chosen = choose_branch(experiment.evaluation, branch)
     interpolation = experiment.motion.clips.interpolation
     predictor = ClipPredictor(
-        trained_network(found, experiment), mode, chosen, experiment.evaluation, interpolation
+        load_network(found, experiment), mode, chosen, experiment.evaluation, interpolation
     )
     if Path(source).exists():
         plan = plan_export(Path(source), out, format_)
         check_imported_body([target.source for target in plan.targets], predictor.rest, "the network")
         report = predictor.export(plan, strict=strict)
     else:
-        opened = OpenedRun(found, experiment, data_of(found, experiment))
+        opened = OpenedRun(found, experiment, load_run_data(found, experiment))
         report = predict_test_clip(predictor, opened, source, out, format_)
     click.echo(f"run {found.id}: {chosen}, {mode} mode")
     show_exported(report, out)

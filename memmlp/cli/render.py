@@ -121,17 +121,19 @@ def _predict_piece(
 
     from memmlp.common.errors import InputError
     from memmlp.common.progress import announce
-    from memmlp.config.open_run import clip_of
+    from memmlp.config.open_run import find_clip
     from memmlp.evaluation.predictions import predict_clip
     from memmlp.report.pictures.clip_pictures import ClipPiece, find_frame_range
 
     first_run = next(iter(runs.values()))
     title = clip or first_run.test.names[0]
-    first, last = find_frame_range(len(clip_of(first_run.test, title)), title, begin, end, ("--from", "--to"))
+    first, last = find_frame_range(
+        len(find_clip(first_run.test, title)), title, begin, end, ("--from", "--to")
+    )
     truths, predictions = [], {}
     for label, run in runs.items():
         announce(f"render: {label} on {title}")
-        frames = clip_of(run.test, title)
+        frames = find_clip(run.test, title)
         if mode == "stream":  # a stream does not use later frames; windows may
             frames = frames[:last]
         arrays = predict_clip(run.network(), frames, mode)

@@ -80,9 +80,9 @@ def save_command(
         shown.flags,
     )
     if untrained:
-        from memmlp.config.untrained_costs import with_costs
+        from memmlp.config.untrained_costs import measure_untrained_variants
 
-        runs, more_flags = with_costs(shown.sweep, runs)
+        runs, more_flags = measure_untrained_variants(shown.sweep, runs)
         flags = (*flags, *more_flags)
     kept = KeptResults(
         name if is_path(name) else sweep.name,

@@ -69,7 +69,7 @@ def sweep(
     their controls, get more seeds, up to --max-seeds.
     """
     from memmlp.cli.table import ShownSweep, flag_earlier_rounds
-    from memmlp.config.compose_plan import find_sweep, make_plan, sweep_folder
+    from memmlp.config.compose_plan import find_sweep, get_sweep_folder, make_plan
 
     check_rounds_options(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
@@ -77,12 +77,12 @@ def sweep(
     if variants and until_decided:
         raise InputError("--variant: cannot be combined with --until-decided, which chooses the variants")
     chosen = find_sweep(name, overrides)
-    labels = chosen.labels_of(variants)
+    labels = chosen.select_labels(variants)
     outputs = outputs.absolute()
     rounds = load_rounds(chosen, outputs, max_seeds) if until_decided else None
     seeded = rounds.restrict_sweep(chosen) if rounds else chosen
     plan = make_plan(seeded, outputs, prepare=not (status or dry_run))
-    selected = plan.of_variants(labels)
+    selected = plan.select_variants(labels)
     if status or dry_run:
         show(seeded, plan, labels)
         if rounds:
@@ -91,7 +91,7 @@ def sweep(
             click.echo(f"interim analyses at {parts} seeds, with a total error rate of 5 %")
             click.echo("\n".join(describe_progress(rounds, chosen)))
         if dry_run:
-            show_forecast(seeded, selected, labels, workers, sweep_folder(chosen, outputs))
+            show_forecast(seeded, selected, labels, workers, get_sweep_folder(chosen, outputs))
         return
     reset_runs(selected, retry, again)
     work = partial(run_workers, workers=workers)
@@ -100,7 +100,7 @@ def sweep(
         rounds, plan = run_until_decided(chosen, outputs, rounds, work)
         show_outcome(ShownSweep(rounds.restrict_sweep(chosen), plan, rounds), arguments, chosen, labels)
         return
-    if selected.left():
+    if selected.list_remaining():
         work(chosen, selected)
     flags = flag_earlier_rounds(chosen, outputs)
     show_outcome(ShownSweep(chosen, plan, None, flags), arguments, chosen, labels)
@@ -117,20 +117,20 @@ def reset_runs(plan: Plan, failed: bool, networks: bool) -> None:
         networks: whether to reset all started or finished networks.
     """
     for task in plan.tasks if failed else ():
-        plan.run_of(task).retry()
+        plan.get_run(task).retry()
     started = [task for task in plan.tasks if networks and task.kind == NETWORK]
-    for run in {task.id: plan.run_of(task) for task in started}.values():
+    for run in {task.id: plan.get_run(task) for task in started}.values():
         with run.lock():
             run.reset()
 
 
 def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
     """Start workers, and wait until they have finished the plan's runs."""
-    from memmlp.config.compose_plan import sweep_folder
+    from memmlp.config.compose_plan import get_sweep_folder
     from memmlp.sweep.controller import oversee
     from memmlp.sweep.progress_table import Board
 
-    _, fleet = start_fleet(sweep_folder(chosen, plan.outputs), plan, workers, list_devices(plan))
+    _, fleet = start_fleet(get_sweep_folder(chosen, plan.outputs), plan, workers, list_devices(plan))
     oversee(plan, fleet, Board())
 
 
@@ -151,12 +151,12 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
 
     from memmlp.sweep.progress_table import render
 
-    shown = plan.of_variants(labels)
+    shown = plan.select_variants(labels)
     click.echo(f"overrides: {' '.join(chosen.command_line) or 'none'}")  # other overrides make another sweep
     if shown.entries:
-        states = shown.states()
+        states = shown.read_states()
         Console(highlight=False).print(render(shown, states))
-        done = [(e.label, shown.run_of(e).manifest) for e in shown.entries if states[e.key] == "done"]
+        done = [(e.label, shown.get_run(e).manifest) for e in shown.entries if states[e.key] == "done"]
         if done:
             from memmlp.report.tables.flags import flag_older_code  # imports SciPy, which is slow
 
@@ -170,7 +170,7 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
 
 def count_unprepared_runs(chosen: Sweep, plan: Plan, labels: Collection[str]) -> int:
     """Return the number of runs of these variants that the plan lacks because data is not prepared yet."""
-    return sum(one.label in labels for one in chosen.variant_seeds()) - len(plan.entries)
+    return sum(one.label in labels for one in chosen.list_variant_seeds()) - len(plan.entries)
 
 
 def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: Workers, folder: Path) -> None:
@@ -178,13 +178,13 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: W
 
     VQ-VAEs are counted only for runs with prepared data.
     """
-    from memmlp.sweep.plan import forecast
+    from memmlp.sweep.plan import estimate_time
 
     count = workers.count_workers(workers.make_gpu_shares(list_devices(plan)))
-    left, later = plan.left(), count_unprepared_runs(chosen, plan, labels)
+    left, later = plan.list_remaining(), count_unprepared_runs(chosen, plan, labels)
     besides = ", and VQ-VAEs that these runs need" if later else ""
     line = f"{len(left) + later} of {len(plan.tasks) + later} runs to do{besides}, {count} at once"
-    if not later and (found := forecast(plan)):
+    if not later and (found := estimate_time(plan)):
         minutes = found.seconds / count / 60
         line += f": about {minutes:.0f} min, estimated from {found.finished} finished runs"
     click.echo(line)
@@ -204,21 +204,23 @@ def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, lab
     """
     from memmlp.cli.table import SHOWN_MODES, make_plan_table, print_tables
     from memmlp.config import plugins
-    from memmlp.config.compose_plan import sweep_folder
+    from memmlp.config.compose_plan import get_sweep_folder
     from memmlp.report.tables.build_table import write_table
     from memmlp.report.tables.measured_run import load_measured_run
 
-    plan, rounds, command = shown.plan, shown.rounds, " ".join([*arguments, *plugins.config_dir_words()])
-    states = plan.states()
-    failed = [task for task in plan.of_variants(labels).tasks if states[task.key] in ("failed", "blocked")]
+    plan, rounds, command = shown.plan, shown.rounds, " ".join([*arguments, *plugins.format_config_dir()])
+    states = plan.read_states()
+    failed = [
+        task for task in plan.select_variants(labels).tasks if states[task.key] in ("failed", "blocked")
+    ]
     found = make_plan_table(shown, SHOWN_MODES["both"], f"memmlp sweep {command}", load_measured_run)
-    write_table(found.table, sweep_folder(chosen, plan.outputs))
+    write_table(found.table, get_sweep_folder(chosen, plan.outputs))
     print_tables([found.table])
     for line in describe_end(rounds, chosen) if rounds else ():
         click.echo(line)
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
     for task in failed:
-        reason = plan.run_of(task).failure or "a prerequisite run failed"
+        reason = plan.get_run(task).failure or "a prerequisite run failed"
         click.echo(f"failed: run {task.id}: {reason}", err=True)
     if failed:
         click.echo("repeat failed runs with --retry", err=True)
@@ -294,7 +296,7 @@ def run_until_decided(
         spent = rounds.restrict_sweep(sweep)
         plan = make_plan(spent, outputs, prepare=True)
         check_same_runs(rounds, sweep, plan, get_rounds_path(sweep, outputs))
-        if plan.left():
+        if plan.list_remaining():
             work(spent, plan)
         after = analyse(sweep, outputs, rounds, plan)
         if after == rounds:
@@ -363,7 +365,7 @@ def describe_end(rounds: Rounds, sweep: Sweep) -> list[str]:
         lines.append(
             "no number of seeds is enough: all test clips form one group, or a network diverged on a clip"
         )
-    used, variants = sum(rounds.count_seeds(sweep).values()), len(sweep.runnable())
+    used, variants = sum(rounds.count_seeds(sweep).values()), len(sweep.list_runnable())
     last = max((one.seeds for one in rounds.analyses), default=rounds.schedule[0])
     fixed = [
         f"{variants * seeds} with {seeds} seeds for every variant"

@@ -206,7 +206,7 @@ def gather_tables(
         except InputError as error:
             failures.append(error)
             table = make_empty_table(sweep, modes, f"nothing measured: {error}")
-            found.append(SweepTable(sweep, {variant.label: {} for variant in sweep.runnable()}, table))
+            found.append(SweepTable(sweep, {variant.label: {} for variant in sweep.list_runnable()}, table))
     asked = overrides or selection.source or selection.together or found[0].sweep.table is None
     if failures and asked and len(failures) == len(found):
         raise failures[0]
@@ -235,9 +235,9 @@ def make_plan_table(
             raise InputError(f"--{option} {given}: cannot be combined with --until-decided")
     runs = find_finished_runs(sweep, make_run_finder(plan, read))
     if selection.untrained:
-        from memmlp.config.untrained_costs import with_costs
+        from memmlp.config.untrained_costs import measure_untrained_variants
 
-        runs, measured = with_costs(sweep, runs)
+        runs, measured = measure_untrained_variants(sweep, runs)
         flags = (*flags, *measured)
     sweep, runs, restricted = restrict_and_group_clips(sweep, runs, selection.source, selection.together)
     flags = (*restricted, *flags)
@@ -249,11 +249,11 @@ def make_plan_table(
 def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
     """Find the sweeps with a name and overrides; return each sweep with its command."""
     from memmlp.config.compose_plan import find_sweep
-    from memmlp.config.plugins import config_dir_words, packaged
+    from memmlp.config.plugins import find_packaged_folder, format_config_dir
 
-    tables = sorted(path.stem for path in packaged("sweeps").glob("table*.yaml"))
+    tables = sorted(path.stem for path in find_packaged_folder("sweeps").glob("table*.yaml"))
     return [
-        (find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides, *config_dir_words()]))
+        (find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides, *format_config_dir()]))
         for one in (tables if name == "all" else [name])
     ]
 
@@ -375,7 +375,7 @@ def flag_earlier_rounds(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
 
 def get_rounds_path(sweep: Sweep, outputs: Path) -> Path:
     """Return the path of a sweep's saved seed rounds."""
-    from memmlp.config.compose_plan import sweep_folder
+    from memmlp.config.compose_plan import get_sweep_folder
     from memmlp.report.tables.seed_rounds import ROUNDS_FILE
 
-    return sweep_folder(sweep, outputs) / ROUNDS_FILE
+    return get_sweep_folder(sweep, outputs) / ROUNDS_FILE

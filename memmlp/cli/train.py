@@ -15,17 +15,17 @@ from omegaconf import DictConfig
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.overrides import parse_overrides
-from memmlp.config.check import explain
+from memmlp.config.check import explain_error
 from memmlp.config.compose import (
     CONFIG,
     VERSION_BASE,
     check_overrides,
-    help_text,
-    hydra_arguments,
-    parse,
-    preflight,
+    compose_jobs,
+    format_help,
+    format_hydra_arguments,
+    parse_hydra_arguments,
 )
-from memmlp.config.plugins import packaged
+from memmlp.config.plugins import find_packaged_folder
 
 if TYPE_CHECKING:
     from memmlp.training.request import Outcome
@@ -52,14 +52,14 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
     Raises:
         InputError: for bad input. If several jobs fail, the last failure is raised; the others are printed.
     """
-    args = parse(argv)
+    args = parse_hydra_arguments(argv)
     only_prints = any((args.hydra_help, args.cfg, args.info, args.shell_completion))
     if args.help or args.cfg:
         check_overrides(args)
     if args.help:
-        click.echo(help_text(args))
+        click.echo(format_help(args))
         return
-    jobs = [] if only_prints else preflight(args)
+    jobs = [] if only_prints else compose_jobs(args)
     if len(jobs) > 1 and distributed.world_size() > 1:
         raise InputError("torchrun: several processes train one run; start it without --multirun")
     _check_prediction_folders(jobs)
@@ -82,14 +82,16 @@ def _run_with_hydra(args: argparse.Namespace, task: Callable[[DictConfig], None]
 
     Errors of Hydra are raised as InputError, with a message in one line.
     """
-    main = hydra.main(config_path=str(packaged("conf")), config_name=CONFIG, version_base=VERSION_BASE)
+    main = hydra.main(
+        config_path=str(find_packaged_folder("conf")), config_name=CONFIG, version_base=VERSION_BASE
+    )
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv, os.environ["HYDRA_FULL_ERROR"] = ["memmlp train", *hydra_arguments(args)], "1"
+    sys.argv, os.environ["HYDRA_FULL_ERROR"] = ["memmlp train", *format_hydra_arguments(args)], "1"
     try:
         main(task)()
     except Exception as error:
         if type(error).__module__.split(".")[0] in ("hydra", "omegaconf"):
-            raise InputError(explain(error, args.overrides)) from error
+            raise InputError(explain_error(error, args.overrides)) from error
         raise
     finally:
         sys.argv = argv

@@ -100,15 +100,15 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     """
     from memmlp.common.files import digest
     from memmlp.config.compose import compose_plain
-    from memmlp.config.plugins import activate, find_named
+    from memmlp.config.plugins import activate, find_named_packages
     from memmlp.sweep.search.search_file import parse_search
 
-    activate(find_named(overrides))
+    activate(find_named_packages(overrides))
     own = [text for text in overrides if Override.parse(text).group == "search"]
     content = compose_plain("tune", own, config_dir).get("search")
     if not isinstance(content, dict):
         raise InputError("search: must be the name of a file in conf/search")
-    activate(find_named(map(str, content.get("base") or ())))
+    activate(find_named_packages(map(str, content.get("base") or ())))
     parsed = parse_search(content)
     remaining = tuple(text for text in overrides if text not in own)
     setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
@@ -139,8 +139,8 @@ def _check_space(setup: SearchSetup) -> str:
                 f"{override}: is searched; remove it from the space with search.space.{override.key}=null"
             )
     requests = [_make_requests(setup, {})[0]]
-    for number in range(max(len(one.corners()) for one in space)):
-        corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
+    for number in range(max(len(one.list_corners()) for one in space)):
+        corner = {one.key: one.list_corners()[number % len(one.list_corners())] for one in space}
         try:
             requests.append(_make_requests(setup, corner)[0])
         except InputError as error:
@@ -160,7 +160,7 @@ def _check_space(setup: SearchSetup) -> str:
         counts = any(affects_training(one.key, config) for config in configs)
         if not isinstance(configs[0].get(one.key), Mapping) and not counts:
             raise InputError(f"search.space.{one.key}: does not change the training")
-    first = _make_tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
+    first = _make_tasks(setup, next(iter(setup.search.list_first_trials()), {}))[0][-1]
     often = f"validated every {first.config['optim']['validate_every']} steps"  # trials can be pruned then
     trained = digest(
         [one.identity("").id for one in requests]
@@ -169,18 +169,18 @@ def _check_space(setup: SearchSetup) -> str:
 
 
 def _make_tasks(setup: SearchSetup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
-    from memmlp.config.compose_plan import tasks_of
+    from memmlp.config.compose_plan import make_tasks
 
     requests = _make_requests(setup, values)
-    return [tasks_of(request, request.motion.prepare().digest) for request in requests]
+    return [make_tasks(request, request.motion.prepare().digest) for request in requests]
 
 
 def _make_requests(setup: SearchSetup, values: Mapping[str, Value]) -> list[RunRequest]:
     """Return the checked requests of a trial, one for each seed."""
     from memmlp.config.build_request import build_request
-    from memmlp.config.compose import composed
+    from memmlp.config.compose import compose_config
 
-    cfg = composed([*setup.config_options, *setup.list_overrides(values)])
+    cfg = compose_config([*setup.config_options, *setup.list_overrides(values)])
     cfg.paths.outputs = str(setup.outputs)
     first, found = cfg.seed, []
     for number in range(setup.search.seeds):
@@ -203,7 +203,7 @@ def show(setup: SearchSetup) -> None:
 def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
     """Run the study until it has all trials of the search."""
     from memmlp.sweep.plan import Plan
-    from memmlp.sweep.search.director import Director, direct
+    from memmlp.sweep.search.director import Director, direct_search
     from memmlp.sweep.search.progress_table import SearchBoard
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
@@ -220,16 +220,16 @@ def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
 
     director = Director(study, partial(_make_tasks, setup), plan, check)
     path, fleet = start_fleet(setup.folder, plan, workers, {base.config["device"]})
-    direct(director, fleet, SearchBoard(setup.outputs), path)
+    direct_search(director, fleet, SearchBoard(setup.outputs), path)
 
 
 def write_results(setup: SearchSetup, study: Study) -> None:
     """Write the results of the search into its folder."""
-    from memmlp.config.plugins import packaged
+    from memmlp.config.plugins import find_packaged_folder
     from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")
-    groups = [path.name for path in packaged("conf").iterdir() if path.is_dir()]
+    groups = [path.name for path in find_packaged_folder("conf").iterdir() if path.is_dir()]
     results.write_experiments(study, setup.folder, groups)
     try:
         results.write_plots(study, setup.folder / "study.html")
@@ -245,32 +245,42 @@ def print_summary(setup: SearchSetup, study: Study) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    from memmlp.sweep.search.progress_table import add_row, count_trials, figures, trials_table
-    from memmlp.sweep.search.results import IMPORTANCE, boundary_warnings, importances, too_few_trials
-    from memmlp.sweep.search.study import trial_values
+    from memmlp.sweep.search.progress_table import (
+        add_row,
+        describe_counts,
+        format_objectives,
+        make_trials_table,
+    )
+    from memmlp.sweep.search.results import (
+        IMPORTANCE,
+        compute_importances,
+        explain_missing_importances,
+        find_boundary_warnings,
+    )
+    from memmlp.sweep.search.study import get_values
     from memmlp.training.request import describe_missing_data
 
     console = Console(highlight=False)
-    best = study.best()
+    best = study.list_best()
     if best:
         title = "Pareto front" if len(study.search.objectives) > 1 else "best trial"
-        table = trials_table(study.search, f"{title}, validation errors")
+        table = make_trials_table(study.search, f"{title}, validation errors")
         for trial in best:
-            add_row(table, study.search, trial, Text(figures(trial)))
+            add_row(table, study.search, trial, Text(format_objectives(trial)))
         console.print(table)
-    if found := importances(study.study):
+    if found := compute_importances(study.study):
         click.echo(f"importance, {IMPORTANCE}: {', '.join(f'{key} {share:.2f}' for key, share in found)}")
-    elif few := too_few_trials(study.study):
+    elif few := explain_missing_importances(study.study):
         click.echo(f"importance: {few}")
-    for line in boundary_warnings(study.study):
+    for line in find_boundary_warnings(study.study):
         click.echo(line)
-    click.echo(count_trials(study))
+    click.echo(describe_counts(study))
     request = _make_requests(setup, {})[0]
     if part := describe_missing_data(request.config, request.motion.prepare()):
         click.echo(f"incomplete data: {part}")
     click.echo(f"in {setup.folder}")
     if best:
-        words = setup.list_overrides(trial_values(best[0], setup.search))[1:]
+        words = setup.list_overrides(get_values(best[0], setup.search))[1:]
         click.echo(f"next: memmlp train {shlex.join([*setup.config_options, *words])}")
     else:
         reasons = [trial.user_attrs["reason"] for trial in study.trials if "reason" in trial.user_attrs]

@@ -54,13 +54,13 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
     import torch
 
     from memmlp.common.errors import InputError
-    from memmlp.config.open_run import OpenedRun, clip_of, data_of, experiment_of
+    from memmlp.config.open_run import OpenedRun, build_run_experiment, find_clip, load_run_data
     from memmlp.evaluation.predictions import predict_clip
 
     torch.set_num_threads(1)  # leaves the other threads to training processes
-    experiment = experiment_of(run)
+    experiment = build_run_experiment(run)
     if experiment.motion.digest() is None:
         raise InputError(f"run {run.id}: its data is not prepared here; prepare it with memmlp eval {run.id}")
-    opened = OpenedRun(run, experiment, data_of(run, experiment))
+    opened = OpenedRun(run, experiment, load_run_data(run, experiment))
     with torch.inference_mode():
-        return predict_clip(opened.network(), clip_of(opened.test, clip, "clip"), mode)
+        return predict_clip(opened.network(), find_clip(opened.test, clip, "clip"), mode)

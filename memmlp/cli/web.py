@@ -59,7 +59,7 @@ def web(
     """
     check_runs_exist(outputs, *runs)
     from memmlp.common.errors import InputError
-    from memmlp.config.build import untrained
+    from memmlp.config.build import build_untrained
     from memmlp.config.open_run import open_run
     from memmlp.live.web.site import RANDOM, Site, SiteNetwork, check_site_folder
 
@@ -69,7 +69,7 @@ def web(
         raise InputError(f"{' '.join(runs)}: expected each run only once")
     clips_by_run = {one.run.id: pack_clips(one, clips, seconds) for one in opened}
     networks = [describe_network(one, clips_by_run[one.run.id]) for one in opened]
-    base = None if no_bench else SiteNetwork("avatar-poser", "AvatarPoser", RANDOM, untrained(BASE))
+    base = None if no_bench else SiteNetwork("avatar-poser", "AvatarPoser", RANDOM, build_untrained(BASE))
     site = Site(
         networks=networks,
         base=base,

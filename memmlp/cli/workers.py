@@ -19,7 +19,7 @@ from memmlp.common.overrides import Override
 if TYPE_CHECKING:
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.executors import Executor
-    from memmlp.sweep.executors.local import Share
+    from memmlp.sweep.executors.local import GpuGroup
     from memmlp.sweep.plan import Plan
 
 EXECUTORS = ("local", "slurm", "ray", "dask", "debug")  # debug runs everything in this process, for debuggers
@@ -59,9 +59,9 @@ class Workers:
         """Parse and check the executor's settings. Raises InputError for a wrong setting."""
         if self.executor == "slurm":
             import_optional("submitit", "slurm", "executor=slurm")
-            from memmlp.sweep.executors.slurm import slurm_options
+            from memmlp.sweep.executors.slurm import parse_slurm_options
 
-            return slurm_options(self.settings)
+            return parse_slurm_options(self.settings)
         if self.executor not in ("ray", "dask"):
             return None
         from memmlp.sweep.executors import dask_cluster, parse_settings, ray_cluster
@@ -73,17 +73,17 @@ class Workers:
         """Return the batch file for sbatch; an empty text for executors other than Slurm."""
         if self.executor != "slurm":
             return ""
-        from memmlp.sweep.executors.slurm import batch_script
+        from memmlp.sweep.executors.slurm import format_batch_script
 
-        return batch_script(get_log_path(folder), self.parse_options(), self.count_workers())
+        return format_batch_script(get_log_path(folder), self.parse_options(), self.count_workers())
 
-    def count_workers(self, shares: Sequence[Share] = ()) -> int:
+    def count_workers(self, shares: Sequence[GpuGroup] = ()) -> int:
         """Return the number of concurrent workers, given their shares of this machine's GPUs."""
-        from memmlp.sweep.executors.local import worker_count
+        from memmlp.sweep.executors.local import count_workers
 
-        return worker_count(shares, self.count, self.workers_per_gpu)
+        return count_workers(shares, self.count, self.workers_per_gpu)
 
-    def make_gpu_shares(self, devices: Iterable[str]) -> list[Share]:
+    def make_gpu_shares(self, devices: Iterable[str]) -> list[GpuGroup]:
         """Divide this machine's GPUs into shares for local workers, for runs on these devices.
 
         Args:
@@ -92,11 +92,11 @@ class Workers:
         Raises:
             InputError: if a run requests a GPU that its worker cannot use; the message names the key.
         """
-        from memmlp.sweep.executors.local import divide_gpus, visible_gpus
+        from memmlp.sweep.executors.local import divide_gpus, list_visible_gpus
 
         wanted = [name for name in devices if name not in DEVICES_WITHOUT_GPU]
         local = self.executor == "local"
-        gpus = visible_gpus() if wanted and local and self.gpus_per_worker != 0 else ()
+        gpus = list_visible_gpus() if wanted and local and self.gpus_per_worker != 0 else ()
         for name in wanted:
             if ":" in name:
                 raise InputError(
@@ -111,7 +111,7 @@ class Workers:
                 raise InputError(line)
         return divide_gpus(gpus, self.gpus_per_worker)
 
-    def start_executor(self, folder: Path, shares: Sequence[Share], gpus: bool) -> Executor:
+    def start_executor(self, folder: Path, shares: Sequence[GpuGroup], gpus: bool) -> Executor:
         """Make the executor. Its workers write logs in `folder`/workers.
 
         Args:
@@ -136,9 +136,9 @@ class Workers:
             from memmlp.config.plugins import import_object
 
             return import_object(self.executor, "executor")(get_log_path(folder), self.settings)
-        from memmlp.sweep.executors.local import Debug, Local
+        from memmlp.sweep.executors.local import DebugExecutor, LocalExecutor
 
-        return Debug() if self.executor == "debug" else Local(get_log_path(folder), shares)
+        return DebugExecutor() if self.executor == "debug" else LocalExecutor(get_log_path(folder), shares)
 
 
 def get_log_path(folder: Path) -> Path:

@@ -17,11 +17,11 @@ from omegaconf.errors import OmegaConfBaseException
 from memmlp.common.components import Component, find_chosen_settings, find_component
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
-from memmlp.config.build_request import build_request, shares
+from memmlp.config.build_request import build_request, read_source_weights
 from memmlp.config.check import check
-from memmlp.config.compose import composed
-from memmlp.config.name_from_config import readable_name
-from memmlp.config.schema import restored
+from memmlp.config.compose import compose_config
+from memmlp.config.name_from_config import make_readable_name
+from memmlp.config.schema import restore_config
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
@@ -43,28 +43,27 @@ from memmlp.training.train_network import NetworkTraining, Training, VQVAETraini
 from memmlp.training.train_refiner import RefinerTraining
 
 
-def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
+def build_experiment(cfg: DictConfig, remote: bool = False) -> Experiment:
     """Build the experiment of a checked config.
 
     Args:
         cfg: the config.
-        elsewhere: whether other processes will perform it, perhaps on another machine, so that this machine
-            need not have its device.
+        remote: whether this process does not train it, so the config's device may be missing here.
 
     Raises:
-        InputError: if the config's device, or the code of a custom component, does not exist here.
+        InputError: if the config's device, or the code of a custom component, is missing.
     """
     unrefined = None
     if cfg.refiner is not None:
         bare = cfg.copy()
         bare.refiner, bare.force, bare.save_predictions = None, False, None
-        unrefined = build_experiment(bare, elsewhere)
+        unrefined = build_experiment(bare, remote)
     request = build_request(cfg)
     metrics = build_metrics(cfg.evaluation.metrics)
     return Experiment(
         config=request.config,
         motion=request.motion,
-        device=torch.device("cpu") if elsewhere else choose_device(cfg.device),
+        device=torch.device("cpu") if remote else choose_device(cfg.device),
         architecture=build_architecture(cfg),
         prerequisites=build_prerequisites(cfg, request.config),
         training=build_training(cfg, metrics),
@@ -77,19 +76,19 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         ),
         deployment=build_deployment(cfg),
         loggers=build_loggers(cfg),
-        make_name=readable_name,
+        make_name=make_readable_name,
         unrefined=unrefined,
     )
 
 
 def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Training, ...]:
-    """Build the trainings of the prerequisite runs of a checked config's network, in order.
+    """Build the trainings of the prerequisite runs that a checked config needs, in order.
 
-    The only prerequisite of a refiner is its network's run.
+    The result is empty for a refiner, which needs only the run of its network.
 
     Args:
         cfg: the config.
-        config: the same config, resolved.
+        config: the resolved config as plain dictionaries.
     """
     if cfg.refiner is not None:
         return ()
@@ -104,18 +103,18 @@ def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Traini
 
 
 def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTraining | RefinerTraining:
-    """Build the training of a checked config's network, or of the refiner behind it."""
+    """Build the training of a checked config's refiner, or of its network if it has no refiner."""
     common = {"seed": cfg.seed, "optim": build(cfg, "optim"), "drawn_by": cfg.data.drawn_by}
-    common |= {"shares": shares(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
+    common |= {"shares": read_source_weights(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
     if cfg.refiner is not None:
-        refiner = _settings(cfg, "refiner")
+        refiner = _make_settings(cfg, "refiner")
         return RefinerTraining(refiner=refiner, **common | {"optim": common["optim"].with_lr(refiner.lr)})
     return NetworkTraining(loss=build_loss(cfg), rollout=build(cfg, "rollout"), **common)
 
 
-def untrained(overrides: Sequence[str]) -> MotionModel:
-    """Build the network for a command line's overrides, with random weights, on the built-in body."""
-    architecture = build_architecture(composed(list(overrides)))
+def build_untrained(overrides: Sequence[str]) -> MotionModel:
+    """Build the network that overrides configure, with random weights, for the built-in body."""
+    architecture = build_architecture(compose_config(list(overrides)))
     torch.manual_seed(0)
     codes = architecture.vqvae() if architecture.uses_codes else None
     normalizer = Normalizer.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
@@ -123,9 +122,9 @@ def untrained(overrides: Sequence[str]) -> MotionModel:
 
 
 def build_loggers(cfg: DictConfig) -> Loggers:
-    """Build the loggers of a config, which show its runs elsewhere."""
+    """Build the loggers of a config, such as TensorBoard."""
     outputs = Path(cfg.paths.outputs)
-    nodes = _plain(cfg.loggers)
+    nodes = _convert_to_dict(cfg.loggers)
     return Loggers(
         tuple(find_component("loggers", name).build(nodes[name], outputs=outputs) for name in nodes), outputs
     )
@@ -135,26 +134,26 @@ def build(cfg: DictConfig, slot: str) -> Any:
     """Build the component in a slot of a checked config.
 
     Raises:
-        InputError: if its class does not accept the keys.
+        InputError: if the component's class does not accept the keys.
     """
-    component, keys = _chosen(cfg, slot)
+    component, keys = _read_component(cfg, slot)
     try:
         return component.build(keys)
     except TypeError as error:
         raise InputError(f"{slot}={component.name}: cannot be built: {error}") from error
 
 
-def _chosen(cfg: DictConfig, slot: str) -> tuple[Component, dict[str, Any]]:
-    keys = _plain(cfg[slot])
+def _read_component(cfg: DictConfig, slot: str) -> tuple[Component, dict[str, Any]]:
+    keys = _convert_to_dict(cfg[slot])
     return find_component(slot, keys["name"]), keys
 
 
-def _settings(cfg: DictConfig, slot: str) -> Any:
-    component, keys = _chosen(cfg, slot)
+def _make_settings(cfg: DictConfig, slot: str) -> Any:
+    component, keys = _read_component(cfg, slot)
     return component.make_settings(keys)
 
 
-def _plain(node: DictConfig) -> dict[str, Any]:
+def _convert_to_dict(node: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]
 
 
@@ -162,8 +161,8 @@ def build_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config, which makes and loads the network."""
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SHAPE})
     coordinates = find_component("coordinates", cfg.normalizer.coordinates).kind()
-    refiner = _settings(cfg, "refiner") if cfg.refiner is not None else None
-    build_network, codes = _network(cfg, vqvae)
+    refiner = _make_settings(cfg, "refiner") if cfg.refiner is not None else None
+    build_network, codes = _make_network_builder(cfg, vqvae)
     return Architecture(
         coordinates=coordinates,
         normalize=cfg.normalizer.z_scores,
@@ -175,14 +174,14 @@ def build_architecture(cfg: DictConfig) -> Architecture:
     )
 
 
-def _network(
+def _make_network_builder(
     cfg: DictConfig, vqvae: Callable[[], VQVAE]
 ) -> tuple[Callable[[Normalizer, VQVAE | None], MotionModel], str]:
-    network, settings = find_component("model", cfg.model.name).kind, _settings(cfg, "model")
+    network, settings = find_component("model", cfg.model.name).kind, _make_settings(cfg, "model")
     if cfg.memory is None:
         return lambda normalizer, codes: network(normalizer, settings), ""
-    memory, memory_keys = _chosen(cfg, "memory")
-    predictor, predictor_keys = _chosen(cfg, "predictor")
+    memory, memory_keys = _read_component(cfg, "memory")
+    predictor, predictor_keys = _read_component(cfg, "predictor")
     codes = getattr(memory.settings, "codes", "")
     joint = {"vqvae": vqvae} if codes == "joint" else {}
     assemble = partial(
@@ -195,37 +194,38 @@ def _network(
 
 
 def build_metrics(names: Iterable[str]) -> dict[str, UserMetric]:
-    """Return the custom metrics with these names."""
-    own: dict[str, Any] = {name: find_component("metric", name) for name in names}
-    return {name: UserMetric(metric.kind, metric.settings.of) for name, metric in own.items()}
+    """Build the custom metrics with these names."""
+    components: dict[str, Any] = {name: find_component("metric", name) for name in names}
+    return {name: UserMetric(metric.kind, metric.settings.of) for name, metric in components.items()}
 
 
 def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
-    """Return a function that makes the loss for a network's branches.
+    """Return a function that builds the loss for a network's branches.
 
-    Mem-MLP's loss consists of the weighting, the hand term, a custom term and the branches. A complete loss
-    ignores the branches.
+    Mem-MLP's loss combines a weighting, a hand term and a custom term for the network's branches. A complete
+    loss ignores the branches.
 
     Raises:
-        InputError: for a custom term with a complete loss, or for a branch that the predictor lacks.
+        InputError: if a custom term is combined with a complete loss, or needs a branch that the predictor
+            does not have.
     """
     loss = build(cfg, "loss")
     if isinstance(loss, Loss):
         if cfg.term is not None:
-            raise InputError(f"term={cfg.term.name}: must be null with loss={cfg.loss.name}, a complete loss")
+            raise InputError(f"term={cfg.term.name}: must be null with the complete loss={cfg.loss.name}")
         return lambda branches: loss
     term = build(cfg, "term") if cfg.term is not None else Term()
     branches = find_component("predictor", cfg.predictor.name).kind.branches  # type: ignore[attr-defined]
     if cfg.term is not None and term.branch not in branches:
         raise InputError(
-            f"term={cfg.term.name}: must compare a branch of predictor={cfg.predictor.name}: "
-            f"{' or '.join(branches)}, not {term.branch}"
+            f"term={cfg.term.name}: needs the {term.branch} branch, but predictor={cfg.predictor.name} has "
+            f"only {' and '.join(branches)}"
         )
     return partial(MotionLoss, loss, build(cfg, "hand"), term=term)
 
 
 def build_deployment(cfg: DictConfig) -> Deployment | None:
-    """Build the deployment of a checked config's network; None if it is not deployed."""
+    """Build the deployment of a checked config; None with export.graph=off."""
     return None if cfg.export.graph == "off" else Deployment(**cfg.export)
 
 
@@ -236,46 +236,50 @@ def build_ik(cfg: DictConfig) -> IK:
 
 
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
-    """Build the optimisation of the VQ-VAE; its length may be given in epochs of `frames` frames each."""
-    own = cfg.vqvae
-    keys = {name: own[name] for name in ("batch", "lr", "weight_decay")}
+    """Build the optimisation of the VQ-VAE. An epoch has `frames` frames."""
+    vqvae = cfg.vqvae
+    keys = {name: vqvae[name] for name in ("batch", "lr", "weight_decay")}
     keys |= {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
-    return make_vqvae_optim(own.steps or math.ceil(own.epochs * frames / own.batch), **keys)
+    return make_vqvae_optim(vqvae.steps or math.ceil(vqvae.epochs * frames / vqvae.batch), **keys)
 
 
-def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
+def load_config(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
     """Return the typed and checked config of a finished run of a motion network.
 
     Args:
         run: the run.
-        overrides: KEY=VALUE words that replace keys of its config.
+        overrides: overrides KEY=VALUE of its config.
 
     Raises:
-        InputError: if the run is not finished, its config does not fit this version, an override is wrong, or
-            a package with custom components is not in use.
+        InputError: for an unfinished run, a config that this version cannot read, an invalid override, or a
+            package with custom components that is not in use.
     """
     check_trained(run)
-    plugins.activate(plugins.find_named(overrides))
+    plugins.activate(plugins.find_named_packages(overrides))
     plugins.check_allowed(run.config, run.manifest.get("plugins") or {}, f"run {run.id}")
     try:
-        cfg = restored(run.config)
+        cfg = restore_config(run.config)
     except (OmegaConfBaseException, KeyError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"{run.config_path}: not a config of this version of memmlp ({reason})") from None
+        raise InputError(
+            f"{run.config_path}: this version of memmlp cannot read the config ({reason})"
+        ) from None
     for word in overrides:
-        _override(cfg, word)
+        _apply_override(cfg, word)
     check(cfg)
     return cfg
 
 
-def _override(cfg: DictConfig, word: str) -> None:
+def _apply_override(cfg: DictConfig, word: str) -> None:
     key, equals, _ = word.partition("=")
     if not equals:
         raise InputError(f"{word}: must be KEY=VALUE")
     try:
-        override = OverridesParser.create().parse_override(word)  # a bare off is text, not false
+        override = OverridesParser.create().parse_override(
+            word
+        )  # Hydra's grammar, unlike YAML, reads off as text
         if override.is_sweep_override():
-            raise InputError(f"{word}: must be one value; a list is [in,brackets]")
+            raise InputError(f"{word}: must be a single value, or a list in brackets: [A,B]")
         OmegaConf.update(cfg, key, override.value(), merge=True)
     except (OmegaConfBaseException, HydraException) as error:
         raise InputError(f"{key}: {str(error).splitlines()[0]}") from None

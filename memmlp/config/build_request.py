@@ -1,4 +1,4 @@
-"""Builds the request of a composed config, without torch, so that planning and finished runs are quick."""
+"""Builds the run request of a composed config. It does not import torch, so planning is fast."""
 
 from __future__ import annotations
 
@@ -30,33 +30,32 @@ SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit, "pe
 def build_motion(cfg: DictConfig) -> MotionSource:
     """Build the source of an experiment's motion.
 
-    A synthetic folder's name contains its length and seed, or the name and settings of a custom generator,
-    and the generator's component version after the first, so that other settings and generators never find
-    stale files.
+    The name of a synthetic folder contains the generator's settings and its component version above 1.
+    Therefore, different settings or generators use different folders.
 
     Raises:
-        InputError: if a list of groups can't be read, two folders of a list have the same name, or the
-            generator does not exist.
+        InputError: if a list of groups cannot be read, two folders have the same name, or the generator does
+            not exist.
     """
     data = cfg.data
-    root, split = _clips(data)
+    root, split = _build_clips(data)
     generate: Callable[[Path], object] | None = None
     if data.synth is not None:
         settings = {str(key): value for key, value in data.synth.items() if key != "name"}
         generator = find_component("generator", data.synth.name)
-        made = "-".join([generator.name, *(f"{key}{value}" for key, value in settings.items())])
+        folder = "-".join([generator.name, *(f"{key}{value}" for key, value in settings.items())])
         if generator.name == "puppet":
-            made = f"{data.synth.minutes:g}min-seed{data.synth.seed}"
+            folder = f"{data.synth.minutes:g}min-seed{data.synth.seed}"
         version = f"-v{generator.version}" if generator.version > 1 else ""
-        root, generate = Path(data.root) / f"{made}{version}", partial(_generate, generator, settings)
+        root, generate = Path(data.root) / f"{folder}{version}", partial(_run_generator, generator, settings)
 
-    interpolation = data.get("interpolation", LINES)  # recorded configs from before the key mean lines
+    interpolation = data.get("interpolation", LINES)  # old configs without the key used lines
     clips = ClipFolder(root, split, str(data.body), data.min_frames, data.strict, interpolation)
     caches = Path(cfg.paths.outputs) / "cache"
     return MotionSource(clips, generate, caches, partial=data.get("partial", False))
 
 
-def _generate(generator: Component, settings: Mapping[str, Any], folder: Path) -> None:
+def _run_generator(generator: Component, settings: Mapping[str, Any], folder: Path) -> None:
     generator.kind(folder, **settings)
 
 
@@ -70,14 +69,14 @@ class PuppetSettings(Settings):
 
 
 def synthesize(folder: Path, minutes: float, seed: int) -> None:
-    """Write synthetic clips of this many minutes to a folder; torch is imported first here."""
-    from memmlp.motion.synthetic import synthesize
+    """Write synthetic clips with a total length of `minutes` to a folder."""
+    from memmlp.motion.synthetic import synthesize  # imports torch
 
     synthesize(folder, minutes=minutes, seed=seed)
 
 
-def shares(data: DictConfig) -> Mapping[str, float] | None:
-    """Return the relative weight of each source in training windows; None if no source has a weight."""
+def read_source_weights(data: DictConfig) -> Mapping[str, float] | None:
+    """Return each source's relative weight among training windows; None if no source sets a weight."""
     weights = {name: source.get("weight") for name, source in (data.get("sources") or {}).items()}
     return weights if any(weights.values()) else None
 
@@ -89,15 +88,15 @@ class _Clips(NamedTuple):
     split: Split
 
 
-def _clips(data: DictConfig) -> _Clips:
-    """Return the folder or folders of the clips, and their split; each source is split separately."""
+def _build_clips(data: DictConfig) -> _Clips:
+    """Build the clips' folders and their split. Each source has a separate split."""
     keys: dict[str, Any] = OmegaConf.to_container(data.split, resolve=True)  # type: ignore[assignment]
     if "kinds" in keys:
         keys["kinds"] = {name: Kind(**kind) for name, kind in keys["kinds"].items()}
     split: Any = SPLITS[keys.pop("name")](**keys)
     if sources := data.get("sources"):
         folders = Folders({name: Path(source.root) for name, source in sources.items()})
-        own = {name: _own_split(split, name, source) for name, source in sources.items()}
+        own = {name: _build_source_split(split, name, source) for name, source in sources.items()}
         return _Clips(folders, MixedSplit(own))
     roots = list(data.root) if OmegaConf.is_list(data.root) else [data.root]
     if len(roots) == 1:
@@ -106,8 +105,8 @@ def _clips(data: DictConfig) -> _Clips:
     return _Clips(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
 
 
-def _own_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
-    """Return the split of one source, with its own groups and fractions."""
+def _build_source_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
+    """Return the split of a source, with the source's groups and fractions."""
     own = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
     groups = [*split.groups, *(source.get("groups") or ())]
     try:
@@ -117,21 +116,21 @@ def _own_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit
 
 
 def build_request(cfg: DictConfig) -> RunRequest:
-    """Return what a checked config asks for.
+    """Build the run request of a checked config.
 
     Raises:
-        InputError: if a package of the config is not in use, or its motion source cannot be built.
+        InputError: if a package of the config is not in use, or the motion source cannot be built.
     """
     config = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
-    config["plugins"] = plugins.find_used(config)
+    config["plugins"] = plugins.find_used_packages(config)
     return RunRequest(config, build_motion(cfg))
 
 
 def build_requests(cfg: DictConfig, seeds: Sequence[int]) -> Iterator[RunRequest]:
-    """Yield what a checked config asks for with each of several seeds.
+    """Yield the run request of a checked config for each seed.
 
-    Resolving a config takes most of the time, so that is done once: for further seeds, only the seed and the
-    keys that refer to it are resolved.
+    Resolving a config is slow. Therefore only the seed, and keys that refer to it, are resolved again for
+    later seeds.
     """
     cfg.seed = seeds[0]
     first = build_request(cfg)

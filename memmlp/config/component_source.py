@@ -1,4 +1,4 @@
-"""Hydra's source of the options that components declare, in addition to the folders of YAML files."""
+"""A Hydra config source with the options that components declare, in addition to YAML files."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ def is_group(path: str) -> bool:
 
 
 class ComponentSource(ConfigSource):
-    """Offers GROUP/NAME for each component, GROUP/default for groups of one option, and schema/NAME.
+    """Provides GROUP/NAME for each component, GROUP/default for groups with one option, and schema/NAME.
 
-    An option is made only when it is loaded, so that no other component is read.
+    An option is created only when Hydra loads it, so other components are not read.
     """
 
     @staticmethod
     def scheme() -> str:
-        """Return the scheme of the search path's entry."""
+        """Return the URL scheme of this source in Hydra's search path."""
         return SCHEME
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """Return the typed config of an option, with the options and keys that come with it."""
+        """Return an option's typed config, with the defaults and keys that its component declares."""
         group, _, name = config_path.removesuffix(".yaml").partition("/")
-        package, node = _option(group, name)
+        package, node = _load_option(group, name)
         return ConfigResult(self.provider, f"{SCHEME}://", node, {"package": package})
 
     def available(self) -> bool:
-        """Return true: the components are always there."""
+        """Return True, because components are always available."""
         return True
 
     def is_group(self, config_path: str) -> bool:
@@ -54,7 +54,7 @@ class ComponentSource(ConfigSource):
         return name in self.list(group, ObjectType.CONFIG)
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        """Return the options of a group, none where only groups are asked for."""
+        """Return the options of a group; an empty list if Hydra asks for groups."""
         group = config_path.strip("/")
         if results_filter == ObjectType.GROUP:
             return []
@@ -67,8 +67,8 @@ class ComponentSource(ConfigSource):
         )
 
 
-def _option(group: str, name: str) -> tuple[str | None, DictConfig]:
-    """Return the package of an option, None for its group's own, and its config."""
+def _load_option(group: str, name: str) -> tuple[str | None, DictConfig]:
+    """Return an option's Hydra package, None for the package of its group, and its config."""
     if group in (SCHEMA, *ONLY):
         return None, OmegaConf.structured(SCHEMAS[name] if group == SCHEMA else ONLY[group])
     settings = find_component(group, name).settings
@@ -85,23 +85,25 @@ def _option(group: str, name: str) -> tuple[str | None, DictConfig]:
     return "_global_", cfg
 
 
-def _size(tiny: Any, small: Any, paper: Any, width_fraction: float = 0, *, _root_: DictConfig) -> Any:
+def _choose_size(tiny: Any, small: Any, paper: Any, width_fraction: float = 0, *, _root_: DictConfig) -> Any:
     if width_fraction and _root_.profile.width is not None:
         return round(width_fraction * _root_.profile.width)
     return (tiny, small, paper)[SIZES.index(_root_.profile.sizes)]
 
 
-def _reading(default: Any, literal: Any, *, _root_: DictConfig) -> Any:
+def _choose_reading(default: Any, literal: Any, *, _root_: DictConfig) -> Any:
     return literal if _root_.profile.reading == "literal" else default
 
 
-def _even_layers(depth: int) -> list[int]:
-    return list(range(2, min(depth, 8) + 1, 2))  # of the first eight, also in deeper networks (Table 9)
+def _list_even_layers(depth: int) -> list[int]:
+    return list(
+        range(2, min(depth, 8) + 1, 2)
+    )  # only the first eight layers, also in deeper networks (Table 9)
 
 
-def register() -> None:
-    """Make the components known to Hydra, and the resolvers of their defaults to OmegaConf."""
+def register_components() -> None:
+    """Register the components with Hydra, and the resolvers of their defaults with OmegaConf."""
     Plugins.instance().register(ComponentSource)
-    OmegaConf.register_new_resolver("size", _size, replace=True)
-    OmegaConf.register_new_resolver("reading", _reading, replace=True)
-    OmegaConf.register_new_resolver("even_layers", _even_layers, replace=True)
+    OmegaConf.register_new_resolver("size", _choose_size, replace=True)
+    OmegaConf.register_new_resolver("reading", _choose_reading, replace=True)
+    OmegaConf.register_new_resolver("even_layers", _list_even_layers, replace=True)

@@ -1,4 +1,4 @@
-"""Composes and checks configs from a command line's overrides; every error becomes one line."""
+"""Composes and checks configs from overrides. Every error becomes an InputError of one line."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from memmlp.common.errors import InputError
 from memmlp.common.overrides import Override, parse_overrides, select_last_by_key
 from memmlp.common.settings import Settings
 from memmlp.config import plugins
-from memmlp.config.check import check, explain, unknown_key
-from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register
-from memmlp.config.plugins import packaged
+from memmlp.config.check import check, describe_unknown_key, explain_error
+from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register_components
+from memmlp.config.plugins import find_packaged_folder
 from memmlp.config.schema import Config
 from memmlp.runs.identity import flatten
 
@@ -39,7 +39,7 @@ VERSION_BASE = "1.3"
 CONFIG = "train"
 SEARCHPATH = "hydra.searchpath"
 EXPERIMENT = "experiment"
-"""The group with options that set groups and keys in the whole config."""
+"""The config group with options that override other groups and keys."""
 
 SWITCHES = {
     "--help": "-h", "--hydra-help": None, "--resolve": None, "--run": "-r", "--multirun": "-m",
@@ -52,17 +52,17 @@ VALUES = {
     "--config-name": "-cn",
     "--config-dir": "-cd",
 }
-"""The flags of Hydra's command line and their short forms: those with a value, and those without."""
+"""Hydra's flags with their short forms. SWITCHES have no value; VALUES have one."""
 
 
-def parse(argv: Sequence[str]) -> argparse.Namespace:
-    """Parse Hydra's command line, in which flags may be among the overrides; import the packages it names.
+def parse_hydra_arguments(argv: Sequence[str]) -> argparse.Namespace:
+    """Parse Hydra's command line, with flags and overrides in any order, and activate its plugins.
 
     Raises:
-        InputError: for an unknown flag, or a package that cannot be imported.
+        InputError: for an unknown flag, or a plugin that cannot be used.
     """
     parser = argparse.ArgumentParser(add_help=False)
-    parser.error = _refuse  # type: ignore[method-assign]
+    parser.error = _raise_input_error  # type: ignore[method-assign]
     for flag, short in SWITCHES.items():
         parser.add_argument(*filter(None, (flag, short)), action="store_true")
     for flag, short in VALUES.items():
@@ -70,63 +70,67 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--info", "-i", nargs="?", const="all")
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_intermixed_args(list(argv))
-    plugins.activate(plugins.find_named(args.overrides))
+    plugins.activate(plugins.find_named_packages(args.overrides))
     Plugins.instance().register(UserConfigs)
-    register()
+    register_components()
     return args
 
 
-def _refuse(message: str) -> NoReturn:
+def _raise_input_error(message: str) -> NoReturn:
     raise InputError(f"train: {message} (see memmlp train --help)")
 
 
-def hydra_arguments(args: argparse.Namespace) -> list[str]:
-    """Return parsed arguments as Hydra's own parser expects them: the flags before the overrides."""
-    given = {flag: getattr(args, flag[2:].replace("-", "_")) for flag in (*SWITCHES, *VALUES, "--info")}
-    switches = [flag for flag, value in given.items() if value is True]
-    values = [f"{flag}={value}" for flag, value in given.items() if isinstance(value, str)]
+def format_hydra_arguments(args: argparse.Namespace) -> list[str]:
+    """Return parsed arguments in the order that Hydra's parser expects: flags before overrides."""
+    flags = {flag: getattr(args, flag[2:].replace("-", "_")) for flag in (*SWITCHES, *VALUES, "--info")}
+    switches = [flag for flag, value in flags.items() if value is True]
+    values = [f"{flag}={value}" for flag, value in flags.items() if isinstance(value, str)]
     return [*switches, *values, *args.overrides]
 
 
 class UserConfigs(SearchPathPlugin):
-    """Makes Hydra search the folders of users' configs after memmlp's, wherever it composes."""
+    """Adds users' config folders and the components to Hydra's search path, after memmlp's folder."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add the folders."""
-        for provider, folder in plugins.folders():
+        """Append the folders and the components. Hydra calls this whenever it composes."""
+        for provider, folder in plugins.list_config_folders():
             search_path.append(provider, f"file://{folder}")
         search_path.append(SCHEME, f"{SCHEME}://")
 
 
-def composed(overrides: Sequence[str]) -> DictConfig:
-    """Compose and check the config of one job from its overrides."""
-    (cfg,) = preflight(parse(overrides))
+def compose_config(overrides: Sequence[str]) -> DictConfig:
+    """Compose and check a single job's config."""
+    (cfg,) = compose_jobs(parse_hydra_arguments(overrides))
     return cfg
 
 
 def compose_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
-    """Compose a config other than that of `memmlp train`, and return it as plain dictionaries.
+    """Compose another config than `train`, and return it as plain dictionaries. It is not checked.
 
     Args:
         name: the config's name.
         overrides: the command line's overrides.
-        folder: a folder of the user's own configs, searched first.
+        folder: a folder with custom configs, searched first.
     """
-    args = parse([*(["--config-dir", str(folder)] if folder else []), *overrides])
-    with _hydra(args), _explained(overrides):
+    args = parse_hydra_arguments([*(["--config-dir", str(folder)] if folder else []), *overrides])
+    with _initialize_hydra(args), _convert_errors(overrides):
         return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
 
 
 def find_experiment_keys(options: Sequence[str], overrides: Sequence[str] = ()) -> set[str]:
-    """Return the groups and the dotted keys that options of the group `experiment` set.
+    """Return the groups and dotted keys that options of the group `experiment` set.
 
-    Those that an option sets through other experiments in its defaults list are included.
+    Other experiments in an option's defaults list are included.
 
     Args:
-        options: the options; those that do not exist are left out.
-        overrides: further overrides, of which only `hydra.searchpath` has an effect.
+        options: the options; unknown options are ignored.
+        overrides: further overrides; only `hydra.searchpath` has an effect.
     """
-    folders = [packaged("conf"), *(folder for _, folder in plugins.folders()), *_search_path(overrides)]
+    folders = [
+        find_packaged_folder("conf"),
+        *(folder for _, folder in plugins.list_config_folders()),
+        *_list_search_path(overrides),
+    ]
     found, pending, seen = set[str](), list(options), set[str]()
     while pending:
         name = pending.pop().removeprefix(f"/{EXPERIMENT}/")
@@ -147,57 +151,60 @@ def find_experiment_keys(options: Sequence[str], overrides: Sequence[str] = ()) 
 
 
 def check_overrides(args: argparse.Namespace) -> None:
-    """Raise InputError for a hidden file or a second experiment, which Hydra would drop silently."""
+    """Raise InputError for a hidden config file or a second experiment, which Hydra ignores silently."""
     _check_hidden(args)
-    _jobs(args)  # rejects a second experiment
+    _list_jobs(args)  # rejects a second experiment
 
 
-def preflight(args: argparse.Namespace) -> list[DictConfig]:
-    """Compose and check the config of every job, so that a bad one is reported before any job starts."""
-    _check_first_parts(args)
+def compose_jobs(args: argparse.Namespace) -> list[DictConfig]:
+    """Compose and check the configs of all jobs, before any job starts."""
+    _check_first_key_parts(args)
     configs = []
-    with _hydra(args):
-        for overrides in _jobs(args):
-            with _explained(overrides):
-                configs.append(_compose(args, overrides))
+    with _initialize_hydra(args):
+        for overrides in _list_jobs(args):
+            with _convert_errors(overrides):
+                configs.append(_compose_job(args, overrides))
             check(configs[-1])
             _check_effects(configs[-1], overrides)
     _check_texts(configs[0], args.overrides)
     return configs
 
 
-def _check_first_parts(args: argparse.Namespace) -> None:
-    """Raise InputError for a key with an unknown first part, before the costly composition."""
+def _check_first_key_parts(args: argparse.Namespace) -> None:
+    """Raise InputError for a key with an unknown first part, before the slow composition."""
     if args.config_name or args.config_path:
         return
     keys = [spec.name for spec in dataclasses.fields(Config)]
     for override in parse_overrides(args.overrides):
         first = re.split(r"[./@]", override.key)[0]
         if first.isidentifier() and override.value is not None and first not in (*keys, "hydra", EXPERIMENT):
-            raise InputError(unknown_key(first, keys))
+            raise InputError(describe_unknown_key(first, keys))
 
 
-def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
-    """Compose the config of one job as Hydra does, but the options of groups only once for all jobs.
+def _compose_job(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
+    """Compose a job's config. The result is identical to Hydra's.
 
-    Reading and merging the groups' files takes nine tenths of the time, and a sweep's configs often differ in
-    values alone. Users' own folders may change meanwhile, so they are read each time.
+    Group options are composed only once for all jobs, because this takes 90 % of the time, and a sweep's
+    configs often differ only in values. With custom config folders, Hydra composes each config, because the
+    files may change.
     """
     parsed = OverridesParser.create().parse_overrides(overrides)
     options = [
         override
         for override in parsed
         if not isinstance(override.value(), dict)
-        and (is_group(group := override.key_or_group) or (packaged("conf") / group).is_dir())
+        and (is_group(group := override.key_or_group) or (find_packaged_folder("conf") / group).is_dir())
     ]
     values = [override for override in parsed if override not in options]
-    special = args.config_name or args.config_path or args.config_dir or any(plugins.folders())
+    special = args.config_name or args.config_path or args.config_dir or any(plugins.list_config_folders())
     for one in values:
         special = special or one.type != OverrideType.CHANGE or one.package
         special = special or one.is_sweep_override() or one.is_hydra_override()
     if special:
         return compose(args.config_name or CONFIG, overrides)
-    cfg = cast(DictConfig, pickle.loads(_with_options(*(str(override.input_line) for override in options))))
+    cfg = cast(
+        DictConfig, pickle.loads(_compose_options(*(str(override.input_line) for override in options)))
+    )
     for override in values:
         try:
             OmegaConf.update(cfg, override.key_or_group, override.value(), merge=True)
@@ -208,37 +215,39 @@ def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
 
 
 @functools.lru_cache(maxsize=128)
-def _with_options(*options: str) -> bytes:
-    """Return the config of `memmlp train` with options of groups, pickled, as that is the fastest to copy."""
+def _compose_options(*options: str) -> bytes:
+    """Return the config of `memmlp train` with these group options, pickled for fast copies."""
     cfg = None
     if any(override.key in SLOTS for override in parse_overrides(options)):
         with suppress(OmegaConfBaseException):  # Hydra reports the error
-            cfg = _with_components(options)
+            cfg = _compose_components(options)
     return pickle.dumps(compose(CONFIG, list(options)) if cfg is None else cfg)
 
 
-def _with_components(options: Sequence[str]) -> DictConfig | None:
-    """Put components into their slots of a config that Hydra composed with the other options.
+def _compose_components(options: Sequence[str]) -> DictConfig | None:
+    """Insert components into a config that Hydra composed with the other options.
 
-    Hydra needs 0.2 s for each composition, this a tenth of it. A component sets its own slot; a model also
-    brings options of other slots and some keys.
+    Hydra needs 0.2 s for each composition; this function needs 0.02 s. A component sets its own slot. A model
+    may also set options of other slots, and keys.
 
     Returns:
-        The config that Hydra would compose; None for options that only Hydra can combine.
+        The config that Hydra would compose; None if only Hydra can combine the options.
     """
     chosen = select_last_by_key(options)
     special = any(override.signs or len(override.options) != 1 for override in chosen.values())
     if special or EXPERIMENT in chosen:
         return None
-    cfg: DictConfig = pickle.loads(_with_options(*(o.text for key, o in chosen.items() if key not in SLOTS)))
+    cfg: DictConfig = pickle.loads(
+        _compose_options(*(o.text for key, o in chosen.items() if key not in SLOTS))
+    )
     names = {key: override.options[0] for key, override in chosen.items() if key in SLOTS}
     model = collect_components().get(("model", names.get("model") or cfg.model.name))
-    if model is None or _brings_more("model", cfg.model.name):
+    if model is None or _has_defaults("model", cfg.model.name):
         return None
     for slot, name in {**collect_attribute(model.settings, "defaults"), **names}.items():
         if name is None:
             cfg[slot] = None
-        elif (slot != "model" and _brings_more(slot, name)) or (node := _make_node(slot, name)) is None:
+        elif (slot != "model" and _has_defaults(slot, name)) or (node := _make_node(slot, name)) is None:
             return None
         else:
             cfg[slot] = node
@@ -247,14 +256,14 @@ def _with_components(options: Sequence[str]) -> DictConfig | None:
     return cfg
 
 
-def _brings_more(slot: str, name: str) -> bool:
+def _has_defaults(slot: str, name: str) -> bool:
     kind = found.settings if (found := collect_components().get((slot, name))) else Settings
     return any(collect_attribute(kind, attribute) for attribute in ("defaults", "recipe"))
 
 
 def _make_node(slot: str, name: str) -> DictConfig | None:
-    """Return a component's typed keys, with those of a YAML file if the option is one; None if Hydra must."""
-    path = packaged("conf") / slot / f"{name}.yaml"
+    """Return the typed keys of a component or YAML file; None if only Hydra can compose them."""
+    path = find_packaged_folder("conf") / slot / f"{name}.yaml"
     if not path.is_file():
         found = collect_components().get((slot, name))
         return OmegaConf.structured(found.settings) if found else None
@@ -266,25 +275,28 @@ def _make_node(slot: str, name: str) -> DictConfig | None:
 
 
 def _check_effects(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Raise InputError for a package named too late, or a fraction of the split that each source has."""
+    """Raise InputError for overrides without an effect.
+
+    These are a plugin in a config file, and a split fraction if each source sets its own fraction.
+    """
     for name in cfg.plugins:
-        if name not in plugins.active():
+        if name not in plugins.list_active():
             raise InputError(
-                f"plugins=[{name}]: a config file is read too late to name a package; name it on the command "
-                f"line, in the base of a sweep or search, or with {plugins.VARIABLE}={name}"
+                f"plugins=[{name}]: cannot be set in a config file; set it on the command line, in the base "
+                f"of a sweep or search, or with {plugins.VARIABLE}={name}"
             )
     sources = (cfg.data.get("sources") or {}).values()
     for override in parse_overrides(overrides):
         part = override.key.removeprefix("data.split.")
         own = [one.get(part) for one in sources] if part in ("test", "val") else [None]
         if own and None not in own:
-            raise InputError(f"{override}: each source has its own; set data.sources.NAME.{part}")
+            raise InputError(f"{override}: each source sets its own value; set data.sources.NAME.{part}")
 
 
 def _check_texts(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Raise InputError for a text that Hydra reads as a number or bool and writes in another way.
+    """Raise InputError for a text that Hydra would change, because it reads the text as a number or bool.
 
-    A folder 2024_11 would be 202411, and 1e3 would be 1000.0.
+    For example, a folder 2024_11 would become 202411, and 1e3 would become 1000.0.
     """
     for parsed in OverridesParser.create().parse_overrides(list(overrides)):
         value, kept = parsed.value(), OmegaConf.select(cfg, parsed.key_or_group)
@@ -299,29 +311,29 @@ def _check_texts(cfg: DictConfig, overrides: Sequence[str]) -> None:
         for item in items:
             if isinstance(item, int | float) and str(item) not in parts:
                 quoted = f"\"{typed.key}='{typed.value}'\""
-                raise InputError(f"{typed}: would become {item}; put the value in quotes, {quoted}")
+                raise InputError(f"{typed}: would become {item}; quote the value: {quoted}")
 
 
 HELP = """memmlp train trains, evaluates, exports and times one configuration.
 
 == Configuration groups ==
-Compose your configuration from those groups (group=option)
+Compose your configuration from these groups (GROUP=OPTION)
 
 {groups}
 
 == Config ==
-Override anything in the config (foo.bar=value)
+Override any key of the config (KEY=VALUE)
 
 {config}
-memmlp train --hydra-help lists the flags, such as -m for several runs and --config-dir for your own configs.
+memmlp train --hydra-help lists the flags, such as -m for several runs and --config-dir for custom configs.
 """
 
 
-def help_text(args: argparse.Namespace) -> str:
-    """Return the groups with their options, and the config that the arguments compose."""
-    folders = [packaged("conf"), *(folder for _, folder in plugins.folders())]
+def format_help(args: argparse.Namespace) -> str:
+    """Return the help text: all groups with their options, and the config that the arguments compose."""
+    folders = [find_packaged_folder("conf"), *(folder for _, folder in plugins.list_config_folders())]
     if args.config_dir:
-        folders.append(_folder(args.config_dir, "--config-dir"))
+        folders.append(_find_folder(args.config_dir, "--config-dir"))
     options: dict[str, list[str]] = {}
     for folder in folders:
         for path in sorted(folder.rglob("*.yaml")):
@@ -333,17 +345,17 @@ def help_text(args: argparse.Namespace) -> str:
         for name in sorted(options.keys() - {".", "search"})
         if options[name]
     ]
-    with _hydra(args), _explained(args.overrides):
+    with _initialize_hydra(args), _convert_errors(args.overrides):
         config = OmegaConf.to_yaml(compose(args.config_name or CONFIG, args.overrides), resolve=args.resolve)
     return HELP.format(groups="\n".join(groups), config=config)
 
 
 @contextmanager
-def _hydra(args: argparse.Namespace) -> Iterator[None]:
-    """Initialise Hydra with the search path that the arguments ask for, as when the jobs run."""
+def _initialize_hydra(args: argparse.Namespace) -> Iterator[None]:
+    """Initialise Hydra with the search path of the arguments, within the context."""
     _check_hidden(args)
-    main = _folder(args.config_path or packaged("conf"), "--config-path")
-    own = _folder(args.config_dir, "--config-dir") if args.config_dir else None
+    main = _find_folder(args.config_path or find_packaged_folder("conf"), "--config-path")
+    own = _find_folder(args.config_dir, "--config-dir") if args.config_dir else None
     with (
         plugins.search_folder(own) if own else nullcontext(),
         initialize_config_dir(str(main), job_name="train", version_base=VERSION_BASE),
@@ -352,44 +364,50 @@ def _hydra(args: argparse.Namespace) -> Iterator[None]:
 
 
 def _check_hidden(args: argparse.Namespace) -> None:
-    """Raise InputError for a user's file that Hydra ignores, since an earlier folder has one of its name."""
-    main = _folder(args.config_path or packaged("conf"), "--config-path")
-    before = [main, *(folder for provider, folder in plugins.folders() if provider != plugins.OWN)]
-    own_folders = [_folder(args.config_dir, "--config-dir")] if args.config_dir else []
-    own_folders += [folder for provider, folder in plugins.folders() if provider == plugins.OWN]
-    for folder in [*own_folders, *_search_path(args.overrides)]:
+    """Raise InputError for a custom config file that Hydra ignores.
+
+    Hydra ignores it if a component, or a file in an earlier folder, has its name.
+    """
+    main = _find_folder(args.config_path or find_packaged_folder("conf"), "--config-path")
+    before = [
+        main,
+        *(folder for provider, folder in plugins.list_config_folders() if provider != plugins.OWN),
+    ]
+    own_folders = [_find_folder(args.config_dir, "--config-dir")] if args.config_dir else []
+    own_folders += [folder for provider, folder in plugins.list_config_folders() if provider == plugins.OWN]
+    for folder in [*own_folders, *_list_search_path(args.overrides)]:
         for path in sorted(folder.rglob("*.yaml")):
             if plugins.is_component(path.relative_to(folder)):
-                raise InputError(f"{path}: memmlp has an option of that name; give it another name")
+                raise InputError(f"{path}: memmlp already has an option with this name; rename the file")
         for other in before:
             for path in sorted(other.rglob("*.yaml")):
                 own = folder / path.relative_to(other)
                 if own.is_file() and own.read_bytes() != path.read_bytes():
-                    raise InputError(f"{own}: {path} is used in its place; give it another name")
+                    raise InputError(f"{own}: Hydra would use {path} instead; rename the file")
         before.append(folder)
 
 
-def _search_path(overrides: Sequence[str]) -> list[Path]:
-    """Return the folders that overrides of `hydra.searchpath` name."""
+def _list_search_path(overrides: Sequence[str]) -> list[Path]:
+    """Return the local folders in overrides of `hydra.searchpath`."""
     places = [one for word in parse_overrides(overrides) if word.key == SEARCHPATH for one in word.options]
     local = [place for place in places if "://" not in place or place.startswith("file://")]
     return [Path(place.removeprefix("file://")).absolute() for place in local]
 
 
-def _folder(name: str | Path, option: str) -> Path:
+def _find_folder(name: str | Path, option: str) -> Path:
     if not Path(name).is_dir():
         raise InputError(f"{option} {name}: must be an existing folder")
     return Path(name).absolute()
 
 
-def _jobs(args: argparse.Namespace) -> list[list[str]]:
-    """Return the overrides of each job: of the single one, or of all jobs of a multirun.
+def _list_jobs(args: argparse.Namespace) -> list[list[str]]:
+    """Return the overrides of each job; there is one job without a multirun.
 
     Raises:
-        InputError: for an override that cannot be parsed, or a second choice of experiments, which would
-            replace the first.
+        InputError: for an override that cannot be parsed, or a second `experiment=` override, which would
+            replace the first one.
     """
-    with _explained(args.overrides):
+    with _convert_errors(args.overrides):
         parsed = OverridesParser.create().parse_overrides(args.overrides)
         chosen = list(dict.fromkeys(str(one.input_line) for one in parsed if one.key_or_group == EXPERIMENT))
         if len(chosen) > 1:
@@ -407,11 +425,11 @@ def _jobs(args: argparse.Namespace) -> list[list[str]]:
 
 
 @contextmanager
-def _explained(overrides: Sequence[str]) -> Iterator[None]:
-    """Turn any error while composing into an InputError of one line."""
+def _convert_errors(overrides: Sequence[str]) -> Iterator[None]:
+    """Convert errors of the context into an InputError of one line."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:
-        raise InputError(explain(error, overrides)) from error
+        raise InputError(explain_error(error, overrides)) from error

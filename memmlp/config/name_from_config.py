@@ -1,4 +1,4 @@
-"""A run's readable name, which says how its config differs from the default, as in "memory=gru · seed 1"."""
+"""A run's readable name, which shows changes from the default config, such as "memory=gru · seed 1"."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.components import SLOTS, collect_components
 from memmlp.common.overrides import format_value
-from memmlp.config.component_source import register
+from memmlp.config.component_source import register_components
 from memmlp.config.compose import VERSION_BASE
-from memmlp.config.plugins import packaged
+from memmlp.config.plugins import find_packaged_folder
 from memmlp.runs.identity import NETWORK, find_option, flatten, select_training_config
 from memmlp.runs.lookup import describe_kind
 
 MAX_WORDS = 6
 SEPARATOR = " · "
 SET_BY_MODELS = ("ema",)
-"""Keys of a profile that a model sets; other values show up in the groups that read them."""
+"""Keys of a profile that models set. They are omitted, because the groups that use them show the value."""
 
 
-def readable_name(kind: str, config: Mapping[str, Any]) -> str:
-    """Return a name for a run.
+def make_readable_name(kind: str, config: Mapping[str, Any]) -> str:
+    """Return a readable name for a run.
 
-    The name has the option of a slot, and the value of any other key that differs from the option's default.
-    It does not include the data, or where and how the run is made.
+    It lists options of slots, and values of other keys, that differ from the defaults. Data, paths, loggers
+    and keys without an effect on the results are omitted.
 
     Args:
         kind: the kind of run (see `Identity`).
@@ -38,8 +38,8 @@ def readable_name(kind: str, config: Mapping[str, Any]) -> str:
     """
     words = [] if kind == NETWORK else [describe_kind(kind)]
     try:
-        words += _differences(config)
-    except (HydraException, OmegaConfBaseException):  # a name must not stop a run
+        words += _list_differences(config)
+    except (HydraException, OmegaConfBaseException):  # the run must not fail because of its name
         words.append("own config")
     if len(words) > MAX_WORDS:
         words = [*words[:MAX_WORDS], f"{len(words) - MAX_WORDS} more"]
@@ -47,28 +47,31 @@ def readable_name(kind: str, config: Mapping[str, Any]) -> str:
     return SEPARATOR.join([*(words or ["default"]), f"seed {seed}"])
 
 
-def _differences(config: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the profile, slots and keys that differ from those of `memmlp train` without overrides."""
+def _list_differences(config: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the profile, slots and keys that differ from `memmlp train` without overrides."""
     chosen: list[str] = []
     if profile := config.get("profile"):
         sizes = f"profile={profile['sizes']}"
-        usual = _default((sizes,))["profile"]
+        usual = _compose_default((sizes,))["profile"]
         changed = [key for key in profile if key not in SET_BY_MODELS and profile[key] != usual.get(key)]
         chosen = [sizes, *(f"profile.{key}={format_value(profile[key])}" for key in changed)]
         yield from chosen[profile["sizes"] == "small" :]
     named = [slot for slot in SLOTS if slot in config and (config[slot] is None or "name" in config[slot])]
     options = {slot: find_option(config, slot) for slot in named}
     custom = [slot for slot, option in options.items() if option and not _is_shipped(slot, option)]
-    for slots in (["model"], [slot for slot in options if slot != "model"]):  # a model brings other options
-        default = _default(tuple(chosen))
+    for slots in (
+        ["model"],
+        [slot for slot in options if slot != "model"],
+    ):  # a model may set options of other slots
+        default = _compose_default(tuple(chosen))
         changed = [slot for slot in slots if slot in options and options[slot] != find_option(default, slot)]
         yield from (f"{slot}={options[slot] or 'none'}" for slot in changed)
         chosen += [f"{slot}={options[slot] or 'null'}" for slot in changed if slot not in custom]
-    default = _default(tuple(chosen))
+    default = _compose_default(tuple(chosen))
     own, usual = flatten(config), {"data.drawn_by": "frames", "data.mirror": False} | flatten(default)
     for key in select_training_config(config) | select_training_config(
         default
-    ):  # either may count it where it is set
+    ):  # a key may count in only one of the configs
         group, _, last = key.partition(".")
         if group in (*custom, "profile") or last == "name" or key in ("seed", "vqvae.seed"):
             continue
@@ -82,16 +85,18 @@ def _is_shipped(slot: str, option: str) -> bool:
 
 
 @functools.lru_cache(maxsize=64)
-def _default(overrides: tuple[str, ...]) -> dict[str, Any]:
-    """Return the config of `memmlp train` with these overrides, without the keys that no name mentions.
+def _compose_default(overrides: tuple[str, ...]) -> dict[str, Any]:
+    """Return the config of `memmlp train` with these overrides, without groups that names omit.
 
-    Hydra's current state is restored afterwards, since it has only one at a time.
+    Hydra's global state is restored afterwards.
     """
-    register()
+    register_components()
     hydra = GlobalHydra.instance()
     before, hydra.hydra = hydra.hydra, None
     try:
-        with initialize_config_dir(str(packaged("conf")), version_base=VERSION_BASE, job_name="name"):
+        with initialize_config_dir(
+            str(find_packaged_folder("conf")), version_base=VERSION_BASE, job_name="name"
+        ):
             cfg = compose("train", list(overrides))
     finally:
         GlobalHydra.instance().hydra = before

@@ -1,6 +1,6 @@
-"""Opens a finished run with its experiment and data, for the commands that use it again.
+"""Opens finished runs with their experiments and data, for evaluation, export and live use.
 
-This is in config because only config builds experiments from configs.
+The module is in memmlp.config because only this package builds experiments from configs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import parse_overrides
-from memmlp.config.build import build_experiment, config_of
+from memmlp.config.build import build_experiment, load_config
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.motion_model import MotionModel
@@ -24,12 +24,12 @@ from memmlp.runs.run import Run
 from memmlp.training.devices import choose_device
 from memmlp.training.run_stages import Experiment
 
-ACTING = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
-"""The groups with keys that affect a finished run; the keys of INFERENCE do, too."""
+EFFECTIVE_GROUPS = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
+"""The groups with an effect on the use of a finished run. The keys in INFERENCE also have an effect."""
 
 
 class OpenedRun(NamedTuple):
-    """A finished run, the experiment that its config describes, and its prepared data."""
+    """A finished run with its experiment and prepared data."""
 
     run: Run
     experiment: Experiment
@@ -42,7 +42,7 @@ class OpenedRun(NamedTuple):
 
     def network(self) -> MotionModel:
         """The trained network, in evaluation mode, on the experiment's device."""
-        return trained_network(self.run, self.experiment)
+        return load_network(self.run, self.experiment)
 
 
 def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
@@ -52,66 +52,68 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
         outputs: the folder of runs and caches.
         name: the run's id, the beginning of one, or the run's folder.
         device_name: the device to compute on: "auto", "cpu", "cuda", "cuda:INDEX" or "mps".
-        overrides: KEY=VALUE for keys of the evaluation and the export.
+        overrides: overrides KEY=VALUE of the evaluation and the export.
 
     Raises:
-        InputError: if there is no such run, an override would change its training or nothing at all, or its
-            data has changed since it was trained and tested.
+        InputError: if the run does not exist, an override would change its training or have no effect, or its
+            data has changed since the training.
     """
-    return open_found(find_run(outputs, name), device_name, overrides)
+    return open_existing_run(find_run(outputs, name), device_name, overrides)
 
 
-def open_found(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
-    """Open a run that was already found; see `open_run`."""
-    experiment = experiment_of(run, device_name, overrides)
-    return OpenedRun(run, experiment, data_of(run, experiment))
+def open_existing_run(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
+    """Open a finished run like `open_run`, from its `Run` object."""
+    experiment = build_run_experiment(run, device_name, overrides)
+    return OpenedRun(run, experiment, load_run_data(run, experiment))
 
 
-def data_of(run: Run, experiment: Experiment) -> Prepared:
-    """Return the prepared data of a run. Raises InputError if it has changed since the training."""
-    # What it was trained on may be looked at, however much of its list that is: the digest proves it.
+def load_run_data(run: Run, experiment: Experiment) -> Prepared:
+    """Return the prepared data of a run. Raises InputError if the data has changed since the training."""
+    # Clips of the list may be missing, as long as the digest matches the training data.
     data = replace(experiment.motion, partial=True).prepare()
     if data.digest != run.manifest["data"]:
         root = experiment.motion.clips.root
-        raise InputError(f"run {run.id}: its data has changed since (data.root={root})")
+        raise InputError(f"run {run.id}: its data has changed since the training (data.root={root})")
     return data
 
 
-def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Experiment:
-    """Return the experiment of a finished run, without its data; raises InputError as `open_run` does."""
+def build_run_experiment(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Experiment:
+    """Return the experiment of a finished run, without its data. Raises InputError like `open_run`."""
     experiment = replace(
-        build_experiment(config_of(run, overrides), elsewhere=True), device=choose_device(device_name)
+        build_experiment(load_config(run, overrides), remote=True), device=choose_device(device_name)
     )
     if select_training_config(run.config) != select_training_config(experiment.config):
         words = ", ".join(overrides)
-        raise InputError(f"{words}: changes the training; set keys of evaluation and export only")
+        raise InputError(f"{words}: would change the training; set only keys of evaluation and export")
     for word in parse_overrides(overrides):
-        if word.group not in ACTING and word.key not in INFERENCE:  # such as force=true
-            raise InputError(f"{word}: no effect on a finished run; set keys of evaluation and export only")
+        if word.group not in EFFECTIVE_GROUPS and word.key not in INFERENCE:  # such as force=true
+            raise InputError(
+                f"{word}: has no effect on a finished run; set only keys of evaluation and export"
+            )
     return experiment
 
 
-def trained_network(run: Run, experiment: Experiment) -> MotionModel:
+def load_network(run: Run, experiment: Experiment) -> MotionModel:
     """Return the trained network of a run, in evaluation mode, on the experiment's device."""
     return experiment.architecture.load(run.weights()).to(experiment.device)
 
 
-def clip_of(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:
-    """Return all frames (N, 252) of a test clip. Raises InputError if there is no clip with that name."""
-    return test.clip(clip_index(test, name, key))
+def find_clip(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:
+    """Return all frames (N, 252) of a test clip. Raises InputError for an unknown name."""
+    return test.clip(find_clip_index(test, name, key))
 
 
-def clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
+def find_clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
     """Return the index of a test clip.
 
     Args:
         test: the test clips.
         name: the clip's name.
-        key: the option or argument that gave the name, for the error.
+        key: the option or argument with the name, used in the error message.
 
     Raises:
-        InputError: if there is no clip with that name; the message lists the names.
+        InputError: for an unknown name; the message lists the names.
     """
     if name not in test.names:
-        raise InputError(f"{key} {name}: must be a test clip of the run's data: {', '.join(test.names)}")
+        raise InputError(f"{key} {name}: must be one of the run's test clips ({', '.join(test.names)})")
     return test.names.index(name)

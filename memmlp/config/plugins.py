@@ -1,9 +1,14 @@
-"""The shipped folders of configs and sweeps, and users' packages with custom components.
+"""Plugins (users' packages with custom components), and the shipped folders of configs and sweeps.
 
-A package is in use where the user's command (`plugins=[NAME]`, `--plugins NAME`) or script (`load_run(ID,
-plugins=[NAME])`), a sweep's base, the environment (MEMMLP_PLUGINS) or an installed entry point of the group
-`memmlp.plugins` names it. Reading a run uses no package by itself: a run's folder may come from anybody, and
-any module on the path, even a script in the current folder, could be executed.
+A package is in use if one of these names it:
+
+- the command (`plugins=[NAME]`, `--plugins NAME`) or the script (`load_run(ID, plugins=[NAME])`);
+- the base of a sweep or search;
+- the environment variable MEMMLP_PLUGINS;
+- an installed entry point of the group `memmlp.plugins`.
+
+A run's config does not activate packages, for security: a run's folder may come from anyone, and any module
+on the path could be executed.
 """
 
 from __future__ import annotations
@@ -41,55 +46,55 @@ _own: ContextVar[Path | None] = ContextVar("config_dir", default=None)
 
 
 def activate(names: Iterable[str] = ()) -> None:
-    """Use packages: the named ones, those in the environment, and installed ones with an entry point.
+    """Activate packages: the named ones, and packages from the environment and from entry points.
 
     Raises:
-        InputError: if there is no such package, or it declares something wrong; the message names it.
+        InputError: for a package that does not exist or has an invalid declaration.
     """
-    for name in (*installed(), *split_names(os.environ.get(VARIABLE, "")), *names):
+    for name in (*list_installed(), *split_names(os.environ.get(VARIABLE, "")), *names):
         if name not in _active:
-            _use(name)
+            _use_package(name)
 
 
 @functools.cache
-def installed() -> tuple[str, ...]:
-    """Return the packages that installed distributions name as entry points of the group."""
+def list_installed() -> tuple[str, ...]:
+    """Return the packages that installed distributions declare as entry points."""
     return tuple(dict.fromkeys(entry.module for entry in metadata.entry_points(group=GROUP)))
 
 
 def split_names(text: str) -> list[str]:
-    """Return the names in a text, which are separated by commas."""
+    """Split a text of comma-separated names."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def find_named(words: Iterable[str]) -> list[str]:
-    """Return the packages that overrides such as `plugins=[mine]` name."""
+def find_named_packages(words: Iterable[str]) -> list[str]:
+    """Return the packages in overrides such as `plugins=[mine]`."""
     values = [one.value or "" for one in parse_overrides(words) if one.key == KEY]
-    found: list[str] = []
+    packages: list[str] = []
     for value in values:
         try:
             content = yaml.safe_load(value)
-        except yaml.YAMLError:  # composing reports it
+        except yaml.YAMLError:  # reported when the config is composed
             continue
-        found += [str(name) for name in content] if isinstance(content, list) else []
-    return found
+        packages += [str(name) for name in content] if isinstance(content, list) else []
+    return packages
 
 
-def active() -> Mapping[str, Path]:
-    """Return the packages in use, with their folders or files."""
+def list_active() -> Mapping[str, Path]:
+    """Return the folder or file of each package in use, by name."""
     return _active
 
 
-def folders() -> list[tuple[str, Path]]:
-    """Return the further folders of configs that are searched: those of packages, by name, and the user's."""
+def list_config_folders() -> list[tuple[str, Path]]:
+    """Return the custom config folders, each with its plugin's name, or with OWN for `--config-dir`."""
     own = _own.get()
-    found = [(name, root / "conf") for name, root in _active.items() if (root / "conf").is_dir()]
-    return [*found, *([(OWN, own)] if own else [])]
+    plugin_folders = [(name, root / "conf") for name, root in _active.items() if (root / "conf").is_dir()]
+    return [*plugin_folders, *([(OWN, own)] if own else [])]
 
 
 @contextmanager
 def search_folder(folder: Path | None) -> Iterator[None]:
-    """Search a folder of the user's own configs, that of `--config-dir`, within the context."""
+    """Search the folder of `--config-dir` for configs, within the context."""
     token = _own.set(folder.absolute() if folder else None)
     try:
         yield
@@ -97,21 +102,21 @@ def search_folder(folder: Path | None) -> Iterator[None]:
         _own.reset(token)
 
 
-def config_dir_words() -> list[str]:
-    """Return `--config-dir FOLDER` for a command that should search the same folder, or nothing."""
+def format_config_dir() -> list[str]:
+    """Return the arguments `--config-dir FOLDER` for another command; empty without the option."""
     own = _own.get()
     return ["--config-dir", str(own)] if own else []
 
 
-def _use(name: str) -> None:
-    """Find a package, and add its components and metrics; it is imported when a component is built."""
-    root = _root(name)
+def _use_package(name: str) -> None:
+    """Add a package's components and metrics. It is imported only when a component is built."""
+    root = _find_root(name)
     try:
         add_package(name, root)
         for (slot, option), one in collect_components().items():
             if one.package == name and slot == "metric":
                 _add_metric(option, one)
-        for fault in _hidden(root):
+        for fault in _find_hidden_options(root):
             raise InputError(fault)
     except InputError as error:
         add_package(name, None)
@@ -119,14 +124,14 @@ def _use(name: str) -> None:
     _active[name] = root
 
 
-def _root(name: str) -> Path:
+def _find_root(name: str) -> Path:
     if not NAME.fullmatch(name) or name.split(".")[0] in ("memmlp", *sys.stdlib_module_names):
-        raise InputError(f"plugins: '{name}': must be the name of your own package")
+        raise InputError(f"plugins=[{name}]: must be the name of a custom package")
     try:
         spec = importlib.util.find_spec(name)
     except ModuleNotFoundError:
         spec = None
-    except Exception as error:  # a package around it
+    except Exception as error:  # a parent package failed
         raise InputError(f"plugin {name}: cannot be imported: {type(error).__name__}: {error}") from error
     if spec is None:
         raise InputError(f"plugin {name}: not found; install it, or put its folder on PYTHONPATH")
@@ -138,34 +143,36 @@ def _add_metric(name: str, one: Component) -> None:
 
     facts: Any = one.settings
     if name in UNITS or name in COSTS:
-        raise InputError(f"metric {name}: must have another name, since there is one of that name")
+        raise InputError(f"metric {name}: already exists; rename the custom metric")
     if not issubclass(facts, MetricSettings) or facts.smallest <= 0:
-        raise InputError(f"metric {name}: needs MetricSettings with `smallest` above 0")
+        raise InputError(f"metric {name}: expected MetricSettings with `smallest` above 0")
     if facts.better not in ("lower", "higher") or facts.of not in ("positions", "rotations"):
-        raise InputError(f"metric {name}: better must be lower or higher, and of positions or rotations")
+        raise InputError(
+            f"metric {name}: `better` must be lower or higher, and `of` must be positions or rotations"
+        )
     UNITS[name], SMALLEST[name] = facts.unit, facts.smallest
     if facts.better == "higher":
         HIGHER.add(name)
 
 
-def _hidden(root: Path) -> Iterator[str]:
-    """Yield the package's options with the name of one of memmlp's or of another package."""
-    others = [packaged("conf"), *(folder / "conf" for folder in _active.values())]
+def _find_hidden_options(root: Path) -> Iterator[str]:
+    """Yield an error line for each of a package's config files with an option's name that already exists."""
+    others = [find_packaged_folder("conf"), *(folder / "conf" for folder in _active.values())]
     for path in sorted((root / "conf").rglob("*.yaml")):
         option = path.relative_to(root / "conf")
         taken = any((other / option).exists() for other in others)
         if taken or is_component(option):
-            yield f"{path}: must have another name, since there is an option of that name"
+            yield f"{path}: an option with this name already exists; rename the file"
 
 
 def is_component(option: Path) -> bool:
-    """Return whether memmlp has a component with the group and the name of a config file."""
-    found = collect_components().get((option.parent.as_posix(), option.stem))
-    return found is not None and found.package == "memmlp"
+    """Return whether a config file has the group and name of one of memmlp's components."""
+    component = collect_components().get((option.parent.as_posix(), option.stem))
+    return component is not None and component.package == "memmlp"
 
 
-def find_used(config: Mapping[str, Any]) -> list[str]:
-    """Return the packages of a config's components and metrics, except memmlp."""
+def find_used_packages(config: Mapping[str, Any]) -> list[str]:
+    """Return the packages, except memmlp, of a config's components and metrics."""
     options = [(slot, config[slot]["name"]) for slot in SLOTS if config.get(slot)]
     options += [("metric", name) for name in config["evaluation"].get("metrics") or ()]
     options.append(("coordinates", config["normalizer"]["coordinates"]))
@@ -180,25 +187,27 @@ def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where:
 
     Args:
         config: the config.
-        recorded: the recorded facts about the packages that made the run, by name.
-        where: what the config belongs to, for the error.
+        recorded: the recorded package facts of the run, such as the version, by package name.
+        where: the owner of the config, such as "run ID", for the error message.
 
     Raises:
-        InputError: one line that names the package, and what to do.
+        InputError: for a package that is missing or not in use.
     """
     for name in config.get(KEY) or ():
         if name not in _active:
             version = (recorded.get(name) or {}).get("version")
             shown = f"{name} {version}" if version else name
             if not NAME.fullmatch(name) or importlib.util.find_spec(name.split(".")[0]) is None:
-                found = f"{where}: made with the package {shown}, which is not found"
-                raise InputError(f"{found}; install it, or put its folder on PYTHONPATH")
-            ways = f"--plugins {name} or {VARIABLE}={name}, in Python plugins=['{name}']"
-            raise InputError(f"{where}: needs code of the package {shown}; to trust it, use {ways}")
+                raise InputError(
+                    f"{where}: needs the package {shown}, which was not found; install it, or put its "
+                    "folder on PYTHONPATH"
+                )
+            ways = f"--plugins {name}, {VARIABLE}={name}, or in Python plugins=['{name}']"
+            raise InputError(f"{where}: needs code of the package {shown}; if you trust it, use {ways}")
 
 
 def import_object(path: str, key: str) -> Any:
-    """Return the class or function at a dotted path. Raises InputError, naming the key, for a missing one."""
+    """Import the class or function at a dotted path. Raises InputError, which names the key."""
     try:
         return pkgutil.resolve_name(path)
     except (ImportError, AttributeError, ValueError) as error:
@@ -208,26 +217,28 @@ def import_object(path: str, key: str) -> Any:
 DEFAULT_GROUPING = "cmu"  # the grouping of data=mocap
 
 
-def packaged(name: str) -> Path:
-    """Return the folder `conf` or `sweeps`.
+def find_packaged_folder(name: str) -> Path:
+    """Return the shipped folder `conf` or `sweeps`.
 
-    In a checkout, the folder is beside the package. In an installed package, it is inside, named `_conf` or
-    `_sweeps`.
+    In a checkout, it is beside the package folder. In an installation, it is `_conf` or `_sweeps` inside the
+    package folder.
     """
     package = Path(memmlp.__file__).resolve().parent
     installed = package / f"_{name}"
     return installed if installed.is_dir() else package.parent / name
 
 
-def grouping_to_choose(names: Collection[str]) -> str | None:
-    """Return the shipped grouping that `data=mocap` needs for these clips; None if it has the right one.
+def choose_grouping(names: Collection[str]) -> str | None:
+    """Return the shipped grouping that these clips need in place of DEFAULT_GROUPING.
+
+    Return None if the default fits, or if no grouping fits.
 
     Args:
-        names: clips' names below their folder, without `.npz`.
+        names: paths of clips relative to their folder, without `.npz`.
     """
     fitting = {
         path.stem
-        for path in (packaged("conf") / "data" / "grouping").glob("*.yaml")
+        for path in (find_packaged_folder("conf") / "data" / "grouping").glob("*.yaml")
         for pattern in yaml.safe_load(path.read_text(encoding="utf-8"))["groups"]
         if any(re.search(pattern, name) for name in names)
     }

@@ -1,4 +1,4 @@
-"""Costs of networks that were not trained, for tables that show only costs: their sizes and times."""
+"""Sizes and times of untrained networks, for tables that show only costs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 from memmlp.common.errors import InputError
 from memmlp.common.progress import show_progress
-from memmlp.config.build import build_deployment, untrained
-from memmlp.config.compose import composed
+from memmlp.config.build import build_deployment, build_untrained
+from memmlp.config.compose import compose_config
 from memmlp.deploy.deployment import GRAPHS, Deployment
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import MeasuredRun, measure_untrained
@@ -17,26 +17,28 @@ from memmlp.runs.environment import describe_environment
 from memmlp.sweep.definition import COSTS, SIZES, Sweep
 
 
-def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
-    """Measure untrained networks for a sweep's variants that have no finished run.
+def measure_untrained_variants(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed]
+) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
+    """Measure an untrained network for each variant of a sweep without a finished run.
 
-    Times are measured only if the sweep's table shows any.
+    Times are measured only if the sweep's metrics include a time.
 
     Returns:
-        The runs by variant and seed, including those networks, and flags that say so.
+        The runs by variant and seed, with the untrained networks added, and flags that name these variants.
 
     Raises:
-        InputError: as `check_costs` does.
+        InputError: if the sweep's metrics include errors (see `check_costs`).
     """
     check_costs(sweep)
     timed = not set(sweep.metrics) <= set(SIZES)
-    without = [variant for variant in sweep.runnable() if not runs[variant.label]]
+    without = [variant for variant in sweep.list_runnable() if not runs[variant.label]]
     costs: dict[str, RunsBySeed] = {}
     with show_progress("networks", len(without)) as count:
         for variant in without:
-            count.set_note(variant.label)  # a large one takes minutes
+            count.set_note(variant.label)  # a large network takes minutes
             costs[variant.label] = {
-                sweep.seeds_of(variant)[0]: measure_costs(sweep.all_overrides(variant), timed)
+                sweep.get_seeds(variant)[0]: measure_costs(sweep.merge_overrides(variant), timed)
             }
             count.advance()
     names = ", ".join(f"'{label}'" for label in costs)
@@ -45,27 +47,27 @@ def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, 
 
 
 def check_costs(sweep: Sweep) -> None:
-    """Check that a sweep's table shows only costs. Raises InputError if it needs runs."""
+    """Raise InputError if a sweep's metrics include errors, which need trained networks."""
     if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
         raise InputError(
             f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}; "
-            f"must be a table of only {', '.join(COSTS)}"
+            f"expected only metrics from {', '.join(COSTS)}"
         )
 
 
 def measure_costs(overrides: tuple[str, ...], timed: bool) -> MeasuredRun:
-    """Measure the network for some overrides, with random weights, and the ONNX file of its live step.
+    """Measure a network with random weights, and the ONNX file of its live step.
 
     Args:
-        overrides: the config's overrides.
-        timed: whether its steps are timed, too, as a run's deployment times them.
+        overrides: the overrides that configure the network.
+        timed: whether to measure times in addition to sizes.
     """
     from memmlp.deploy.export import export  # slow to import
     from memmlp.deploy.latency import measure_size
     from memmlp.live.pose_latency import measure_pose_times
 
-    deployment = build_deployment(composed(list(overrides))) or Deployment(latency_steps=1)
-    model = untrained(overrides)
+    deployment = build_deployment(compose_config(list(overrides))) or Deployment(latency_steps=1)
+    model = build_untrained(overrides)
     network = GRAPHS[deployment.graph](model)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "step.onnx"

@@ -1,6 +1,6 @@
-"""What a worker of a sweep does with a task: it builds the experiment and finishes its run.
+"""A worker's process: for each task of a plan, it builds the experiment and finishes the run.
 
-This is in config because only config builds experiments from configs.
+The module is in memmlp.config because only this package builds experiments from configs.
 """
 
 from __future__ import annotations
@@ -10,48 +10,52 @@ from pathlib import Path
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.sweep.worker import Cancelled, Presence, has_controller, work_off
+from memmlp.sweep.worker import Cancelled, Presence, has_controller, work_on_plan
 from memmlp.training.request import RunRequest
 
 
 def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | None:
-    """Work on the tasks of the plan in a file.
+    """Perform the tasks of the plan in a file.
 
     Args:
         path: the plan's file.
-        threads: torch's threads if the config leaves them open; 0 leaves the choice to torch.
-        controller: the file that identifies the controller's process (`Presence`), with which the worker
-            ends. None for a worker on another machine: it works on a closed plan (a sweep's) to its end, and
-            on an open one (a search's) while its controller shows signs of life.
-        gpu: whether this worker should have a GPU.
+        threads: the number of torch's threads if the config does not set it; 0: torch's default.
+        controller: the file of the controller's `Presence`; the worker ends with the controller. None for a
+            worker on another machine, which finishes a closed plan. It leaves an open plan when the
+            controller no longer touches the plan's file.
+        gpu: whether the worker needs a GPU.
 
     Returns:
-        A line if there is no such GPU and nothing was done; else None.
+        A line that explains why the worker has no GPU and did nothing; else None.
     """
-    if gpu and (line := describe_missing_gpu()):
+    if gpu and (line := explain_missing_gpu()):
         return line
-    wanted = partial(Presence.of, Path(controller)) if controller else partial(has_controller, Path(path))
-    work_off(Path(path), partial(perform, Path(path), threads), wanted)
+    should_continue = (
+        partial(Presence.is_alive, Path(controller)) if controller else partial(has_controller, Path(path))
+    )
+    work_on_plan(Path(path), partial(perform_task, Path(path), threads), should_continue)
     return None
 
 
-def describe_missing_gpu() -> str | None:
-    """Return a line that says that torch finds no GPU in a worker that should have one; None if it does."""
+def explain_missing_gpu() -> str | None:
+    """Return a line that explains why torch finds no GPU; None if it finds one."""
     from memmlp.training import devices  # it imports torch
 
     return devices.describe_missing_gpu()
 
 
-def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
-    """Finish the task's run.
+def perform_task(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
+    """Finish a task's run.
 
     Args:
-        path: the plan's file, read again during the training, to see whether the run is still wanted.
-        threads: torch's threads if the config leaves them open; 0 leaves the choice to torch.
+        path: the plan's file, which is read repeatedly to find out whether the run was cancelled.
+        threads: the number of torch's threads if the config does not set it; 0: torch's default.
+        plan: the plan.
+        task: the task.
 
     Raises:
-        Cancelled: if the plan no longer wants the run.
-        InputError: if data or code changed since the plan was made.
+        Cancelled: if the plan cancels the run.
+        InputError: if the data or the code has changed since the plan was made.
     """
     from omegaconf import OmegaConf
 
@@ -68,20 +72,20 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     if task.kind != NETWORK:
         make_prerequisites(experiment, experiment.motion.prepare(), task.id)
     else:
-        run_experiment(experiment, partial(check_wanted, path, task.id))
+        run_experiment(experiment, partial(check_not_cancelled, path, task.id))
 
 
 def check_identity(request: RunRequest, task: RunTask) -> None:
-    """Prepare the data, and raise InputError if the task's identity is no longer the plan's."""
-    from memmlp.config.compose_plan import tasks_of
+    """Prepare the data. Raise InputError if the request no longer has the task's run."""
+    from memmlp.config.compose_plan import make_tasks
 
-    known = tasks_of(request, request.motion.prepare().digest)
-    if task.key not in {key for found in known for key in (found.id, found.key)}:
-        raise InputError(f"run {task.id}: the data or the code changed since the sweep began; start it again")
+    tasks = make_tasks(request, request.motion.prepare().digest)
+    if task.key not in {key for one in tasks for key in (one.id, one.key)}:
+        raise InputError(f"run {task.id}: the data or the code has changed; start the sweep again")
 
 
-def check_wanted(path: Path, run_id: str, step: int, values: dict[str, float]) -> None:
-    """Raise Cancelled once the plan in a file no longer wants this run."""
+def check_not_cancelled(path: Path, run_id: str, step: int, values: dict[str, float]) -> None:
+    """Raise Cancelled if the plan in a file cancels the run."""
     plan = Plan.load(path)
     if run_id in plan.cancelled:
         raise Cancelled(f"run {run_id} was cancelled at step {step}")

@@ -127,16 +127,16 @@ class KeptResults:
             variant.label: {
                 seed: run
                 for seed, run in sorted(self.runs.get(variant.label, {}).items())
-                if seed in sweep.seeds_of(variant)
+                if seed in sweep.get_seeds(variant)
             }
-            for variant in sweep.runnable()
+            for variant in sweep.list_runnable()
         }
 
 
 def list_overrides(sweep: Sweep) -> dict[str, tuple[str, ...]]:
     """Return each variant's overrides from the sweep file, including the base overrides."""
     bare = replace(sweep, command_line=())
-    return {variant.label: shorten_paths(bare.all_overrides(variant)) for variant in sweep.runnable()}
+    return {variant.label: shorten_paths(bare.merge_overrides(variant)) for variant in sweep.list_runnable()}
 
 
 def shorten_paths(overrides: Iterable[str]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The controller of a sweep: it keeps workers going while there is work, and shows the progress."""
+"""The controller of a sweep: it starts workers while runs are missing, and shows the progress."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import Board
 from memmlp.sweep.worker import Presence
 
-LOOK = 0.5  # seconds between looks at the run folders
-QUICK = 20.0  # seconds; a worker that ends sooner has failed to start
-PATIENCE = 5  # how many in a row, times the fleet's size, may fail to start
+LOOK = 0.5  # seconds between two reads of the run folders
+MIN_LIFETIME = 20.0  # seconds; a worker that ends sooner has failed to start
+MAX_FAILED_STARTS = 5  # the maximum number of failed starts in a row, per worker of the fleet
 
 
 class Fleet:
-    """The workers of a controller: as many as there is work for; workers that died are replaced.
+    """The workers of a controller. A worker that died is replaced.
 
     Args:
         executor: starts workers.
-        work: what a worker does.
-        size: the largest number of workers.
-        logs: the folder of the workers' logs, for error messages.
-        presence: shows the workers that the controller is alive, for as long as the fleet exists.
+        work: the function that each worker calls.
+        size: the maximum number of workers.
+        logs: the folder of the workers' logs, named in error messages.
+        presence: shows the workers that the controller is alive; the fleet keeps it from being deleted.
     """
 
     def __init__(
@@ -41,11 +41,11 @@ class Fleet:
         self.failed_starts = 0
         self.complaint: str | None = None
 
-    def keep(self, wanted: int) -> None:
-        """Start workers until `wanted` of them are alive, but no more than the fleet's size.
+    def maintain(self, count: int) -> None:
+        """Start workers until `count` of them, or at most the fleet's size, are alive.
 
         Raises:
-            InputError: if workers, one after another, end as soon as they are started.
+            InputError: if too many workers in a row end as soon as they are started.
         """
         now = time.monotonic()
         living = []
@@ -55,13 +55,13 @@ class Fleet:
                 continue
             complaint = handle.complaint()
             self.complaint = complaint or self.complaint
-            quick = complaint is not None or now - started < QUICK
+            quick = complaint is not None or now - started < MIN_LIFETIME
             self.failed_starts = self.failed_starts + 1 if quick else 0
         self.handles = living
-        if self.failed_starts >= PATIENCE * self.size:
+        if self.failed_starts >= MAX_FAILED_STARTS * self.size:
             reason = self.complaint or "the reason"
             raise InputError(f"workers end as soon as they are started: {reason}; see {self.logs}")
-        if (missing := min(wanted, self.size) - len(self.handles)) > 0:
+        if (missing := min(count, self.size) - len(self.handles)) > 0:
             self.handles += [(handle, now) for handle in self.executor.submit(self.work, missing)]
 
     def cancel(self) -> None:
@@ -72,21 +72,21 @@ class Fleet:
 
 
 def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
-    """Keep the fleet working on the plan until nothing is left.
+    """Keep the fleet working on the plan until no task remains.
 
-    It waits for runs on which workers of other sweeps are working. If this process is interrupted, the
+    It also waits for runs on which other sweeps' workers are working. If this process is interrupted, the
     workers are ended.
 
-    Runs that are done are looked at again only when nothing seems left: a sweep may have many, on a disk that
-    others use, too.
+    Finished runs are read again only when no task seems to remain. This spares the disk, because a sweep may
+    have many runs.
     """
     try:
         with board:
-            board.update(plan, states := plan.states())
-            while left := plan.left(states) or plan.left(states := plan.states()):
-                fleet.keep(len(left))
+            board.update(plan, states := plan.read_states())
+            while left := plan.list_remaining(states) or plan.list_remaining(states := plan.read_states()):
+                fleet.maintain(len(left))
                 time.sleep(LOOK)
-                board.update(plan, states := plan.states(states))
+                board.update(plan, states := plan.read_states(states))
     except BaseException:
         fleet.cancel()
         raise

@@ -1,4 +1,4 @@
-"""A sweep: variants, seeds, the overrides that train each variant, and its copy beside its plan.
+"""A sweep: its variants, their overrides, its seeds, and the copy of the sweep beside its plan.
 
 `memmlp.sweep.sweep_file` reads sweep files.
 """
@@ -18,17 +18,17 @@ from memmlp.common.overrides import Override
 from memmlp.evaluation.metric_facts import SMALLEST
 
 SWEEP_FILE = "sweep.json"
-"""The copy of a sweep in its folder: its table can be shown without composing it."""
+"""The copy of a sweep in its folder, from which its table can be shown without composing configs."""
 MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")
 SIZES = ("FLOPs", "MACs", "parameters", "size")
-"""The costs that a network has before it is trained, on any machine."""
+"""The costs of a network that depend neither on its training nor on the machine."""
 TIMES = ("ms", "network ms", "pose ms", "ratio", "FPS")
-"""The costs that are measured in time, so they differ a little each time."""
+"""The costs that are derived from measured times, so repeated measurements differ slightly."""
 COSTS = (*SIZES, *TIMES)
 """Metrics that are costs, not errors.
 
-Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames per second.
+Units: GFLOP, GMAC, millions, MB, ms, multiples of the reference network's time, and frames per second.
 """
 
 
@@ -38,16 +38,16 @@ class Variant:
 
     Attributes:
         label: the variant's name in the table.
-        overrides: the variant's overrides of the base; None if the row has only the paper's values (a system
-            that is not built here).
-        branch: whose errors the row shows: rotation, position, or combined (after inverse kinematics).
+        overrides: the variant's overrides of the base; None for a row with only the paper's values, such as a
+            system that memmlp does not implement.
+        branch: the branch that the row shows: rotation, position, or combined (after inverse kinematics).
         paper: the paper's values by metric, as printed.
         note: a remark shown under the table.
-        against: the label of the variant that this one is compared with; None for the sweep's control.
-        fixed: whether the file gives the variant a branch of its own.
-        seeds: the variant's own seeds, if seeds are added only to variants with open verdicts; None for the
-            sweep's.
-        series: the variant's label in the file, which is the same in all cells of the axes.
+        against: the label of the variant's control; None for the control of the sweep.
+        fixed: whether the sweep file sets the branch for this variant.
+        seeds: the variant's own seeds, if seeds are added only to variants with inconclusive verdicts; None
+            for the seeds of the sweep.
+        series: the variant's label in the file, without the overrides of the axes.
         cell: the overrides that the axes add, one per key; empty without axes.
     """
 
@@ -64,13 +64,13 @@ class Variant:
 
     @property
     def own_overrides(self) -> tuple[str, ...]:
-        """The variant's overrides without those of its cell."""
+        """The variant's overrides without the overrides of its cell."""
         return tuple(text for text in self.overrides or () if text not in self.cell)
 
 
 @dataclass(frozen=True)
 class VariantSeed:
-    """One training: a variant with a seed, as overrides of `memmlp train`."""
+    """A variant with one seed, as overrides of `memmlp train`."""
 
     label: str
     seed: int
@@ -79,7 +79,7 @@ class VariantSeed:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep file, or one with overrides added on the command line.
+    """The content of a sweep file, with overrides added on the command line.
 
     Attributes:
         name: the file's stem.
@@ -89,11 +89,11 @@ class Sweep:
         base: overrides that all variants share.
         seeds: the seeds of each variant.
         variants: the rows in order.
-        control: the label of the variant with which the others are compared.
+        control: the label of the variant with which all other variants are compared.
         metrics: the columns.
         command_line: overrides given on the command line.
-        branch_source: how we know which branch the paper's values belong to; None if the file does not say.
-        smallest: the smallest effect of interest by metric, in its unit; every metric but costs has one.
+        branch_source: the evidence for the branch of the paper's values; None if the file does not state it.
+        smallest: the smallest effect of interest for each metric except costs, in the metric's unit.
     """
 
     name: str
@@ -110,10 +110,10 @@ class Sweep:
     smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
 
     def with_branch(self, branch: str) -> Sweep:
-        """Return the same sweep with its variants showing another branch.
+        """Return the sweep with variants that show this branch.
 
-        A variant with a branch of its own in the file keeps it. The paper's values belong to the branch for
-        which they were printed, so variants whose branch changes lose them.
+        A variant keeps a branch that the file sets for it. The paper's values belong to the printed branch,
+        so a variant loses them when its branch changes.
 
         Raises:
             InputError: for an unknown branch.
@@ -125,35 +125,35 @@ class Sweep:
         )
         return self if variants == self.variants else replace(self, variants=variants, branch_source=None)
 
-    def control_of(self, variant: Variant) -> str | None:
-        """Return the label of a variant's control: its own `against`, or else the sweep's control.
+    def find_control(self, variant: Variant) -> str | None:
+        """Return the label of a variant's control: `against` if it is set, else the sweep's control.
 
-        It is None for the sweep's control itself, unless that variant has an `against`, too.
+        The result is None for the sweep's control if it does not set `against`.
         """
         return variant.against or (self.control if variant.label != self.control else None)
 
-    def seeds_of(self, variant: Variant) -> tuple[int, ...]:
-        """Return the seeds of a variant: its own if it has any, else the sweep's."""
+    def get_seeds(self, variant: Variant) -> tuple[int, ...]:
+        """Return the seeds that a variant sets, else the seeds of the sweep."""
         return self.seeds if variant.seeds is None else variant.seeds
 
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
-        """Return the same sweep with further overrides, applied after its base and before the variants' own.
+        """Return the sweep with further overrides, applied after its base and before the variants' overrides.
 
         `seed=0,1` or `seed=0` sets the seeds.
 
         Raises:
-            InputError: for an override of the outputs folder, which an option of the command sets, and for a
-                key that a variant sets itself, since the variant's value would win.
+            InputError: for `paths.outputs`, which `--outputs` sets; for `save_predictions`; and for a key
+                that a variant sets, because the variant's value would win.
         """
-        keys = [key_of(text) for text in overrides]
+        keys = [parse_key(text) for text in overrides]
         if "paths.outputs" in keys:
             raise InputError("paths.outputs: expected --outputs FOLDER, or MEMMLP_OUTPUTS")
         if "save_predictions" in keys:
             raise InputError(
-                "save_predictions: a sweep's runs would overwrite each other's; use memmlp eval RUN "
-                "--save-predictions FOLDER"
+                "save_predictions: the runs of a sweep would overwrite each other's predictions; "
+                "use memmlp eval RUN --save-predictions FOLDER"
             )
-        setters = {key_of(text): one.label for one in self.runnable() for text in one.overrides or ()}
+        setters = {parse_key(text): one.label for one in self.list_runnable() for text in one.overrides or ()}
         others, seeds = [], self.seeds
         for text, key in zip(overrides, keys, strict=True):
             if key == "seed":
@@ -162,56 +162,56 @@ class Sweep:
             others.append(text)
             if key in setters:
                 raise InputError(
-                    f"{text}: variant '{setters[key]}' of sweep {self.name} sets {key} itself; "
+                    f"{text}: variant '{setters[key]}' of sweep {self.name} already sets {key}; "
                     "expected a key that no variant sets"
                 )
         return replace(self, command_line=(*self.command_line, *others), seeds=seeds)
 
-    def all_overrides(self, variant: Variant) -> tuple[str, ...]:
-        """Return a variant's overrides: base, command line, its own; the last one of a key wins."""
+    def merge_overrides(self, variant: Variant) -> tuple[str, ...]:
+        """Return the overrides of the base, the command line and the variant; the last one for a key wins."""
         texts = (*self.base, *self.command_line, *(variant.overrides or ()))
-        return tuple({key_of(text): text for text in texts}.values())
+        return tuple({parse_key(text): text for text in texts}.values())
 
-    def runnable(self) -> tuple[Variant, ...]:
-        """Return the variants that can be run: all except those with only the paper's values."""
+    def list_runnable(self) -> tuple[Variant, ...]:
+        """Return all variants except rows with only the paper's values."""
         return tuple(variant for variant in self.variants if variant.overrides is not None)
 
-    def labels_of(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return the labels of the variants that are named, of all that can be run if none is.
+    def select_labels(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return the given labels; without any, the labels of all variants that can be run.
 
         Raises:
-            InputError: for a name that no variant has, or a variant with only the paper's values.
+            InputError: for an unknown label, or a row with only the paper's values.
         """
-        known = [variant.label for variant in self.runnable()]
+        known = [variant.label for variant in self.list_runnable()]
         if missing := [name for name in names if name not in known]:
             raise InputError(
                 f"sweep {self.name}: no variant '{missing[0]}' can be run; expected {', '.join(known)}"
             )
         return tuple(names) or tuple(known)
 
-    def variant_seeds(self) -> list[VariantSeed]:
-        """Return the trainings that the sweep needs, variant by variant."""
+    def list_variant_seeds(self) -> list[VariantSeed]:
+        """Return each variant with each of its seeds, ordered by variant."""
         return [
-            VariantSeed(variant.label, seed, (*self.all_overrides(variant), f"seed={seed}"))
-            for variant in self.runnable()
-            for seed in self.seeds_of(variant)
+            VariantSeed(variant.label, seed, (*self.merge_overrides(variant), f"seed={seed}"))
+            for variant in self.list_runnable()
+            for seed in self.get_seeds(variant)
         ]
 
 
-def key_of(override: str) -> str:
+def parse_key(override: str) -> str:
     """Return the key or group that an override sets, adds (+) or removes (~)."""
     return Override.parse(override).key
 
 
 def parse_branch(value: Any, name: str) -> str:
-    """Return the name of a branch. Raises InputError, naming the key, for an unknown one."""
+    """Return the value if it is a branch's name, else raise InputError, which names the key."""
     if value not in BRANCHES:
         raise InputError(f"{name}: '{value}'; expected one of {', '.join(BRANCHES)}")
     return value
 
 
 def parse_seeds(value: Any, name: str) -> tuple[int, ...]:
-    """Return the seeds, after a check that they are different whole numbers."""
+    """Return the seeds. Raises InputError unless they are different whole numbers."""
     texts = [str(item).strip() for item in value] if isinstance(value, list) else []
     if not texts or not all(re.fullmatch(r"\d+", text) for text in texts) or len(set(texts)) < len(texts):
         raise InputError(f"{name}: {value}; expected a list of whole numbers, each once, such as [0, 1, 2]")
@@ -219,7 +219,7 @@ def parse_seeds(value: Any, name: str) -> tuple[int, ...]:
 
 
 def save_sweep_copy(sweep: Sweep, folder: Path) -> None:
-    """Write the sweep into its folder, unless the folder has the same content already."""
+    """Write the sweep into its folder, unless the file already has this content."""
     content = make_json_safe(asdict(sweep))
     if read_json(folder / SWEEP_FILE) != content:
         folder.mkdir(parents=True, exist_ok=True)
@@ -227,7 +227,7 @@ def save_sweep_copy(sweep: Sweep, folder: Path) -> None:
 
 
 def load_sweep_copy(folder: Path) -> Sweep | None:
-    """Return the sweep kept in a folder; None without one. Raises InputError if it is damaged."""
+    """Return the copy of a sweep in its folder, or None. Raises InputError for a damaged file."""
     path = folder / SWEEP_FILE
     if not path.exists():
         return None
@@ -239,7 +239,7 @@ def load_sweep_copy(folder: Path) -> Sweep | None:
         names = ("notes", "base", "seeds", "variants", "metrics", "command_line")
         return Sweep(**_with_tuples(content, *names))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: not a sweep ({error}); start the sweep again") from None
+        raise InputError(f"{path}: must be a sweep ({error}); start the sweep again") from None
 
 
 def _with_tuples(fields: dict[str, Any], *names: str) -> dict[str, Any]:

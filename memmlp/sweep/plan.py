@@ -1,7 +1,7 @@
 """A plan: the runs that a sweep's variants and seeds need, their progress, and the remaining time.
 
-A plan holds only the runs' identities; their progress is read from the run folders. Plans are made in
-`config/compose_plan.py`, since that composes configs.
+A plan stores the ids and configs of runs. Their progress is read from the run folders. Plans are made in
+`config/compose_plan.py`, because making a plan composes configs.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from memmlp.runs.run import Run
 
 @dataclass(frozen=True)
 class RunTask:
-    """One run to be brought to its end.
+    """A run that must be trained and evaluated.
 
     Attributes:
         id: the run's id.
         kind: the kind of run (see `Identity`).
         config: the resolved config of an experiment that needs the run.
-        prerequisite: the id of the run that must be done first; None for none.
-        stages: identities of the evaluations and the deployment that the run must have.
+        prerequisite: the id of the run that must be done first, or None.
+        stages: the identities of the required evaluations and deployment.
     """
 
     id: str
@@ -40,13 +40,13 @@ class RunTask:
 
     @property
     def key(self) -> str:
-        """The task's key, which no other task has: the run's id, and the stages that are wanted."""
+        """The task's unique key: the run's id and its required stages."""
         return " ".join((self.id, *self.stages))
 
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry of a sweep: the run of a variant with a seed, and its stages after training."""
+    """The run of a variant with a seed, and its required stages after training."""
 
     label: str
     seed: int
@@ -61,15 +61,16 @@ class Entry:
 
 @dataclass(frozen=True)
 class Plan:
-    """The entries of a sweep, and the tasks that they need: each task once, after the tasks that it needs.
+    """The entries of a sweep, and the tasks that they need. Each task occurs once, after its prerequisite.
 
     Attributes:
         name: the sweep's name.
         outputs: the folder of runs and caches.
         entries: the runs of the sweep's variants and seeds.
-        tasks: the runs to be made.
-        open: whether tasks may be added, so that workers stay (a search); a sweep's plan is closed.
-        cancelled: ids of runs that workers must not go on with.
+        tasks: the runs that the entries need.
+        open: whether tasks may be added later, so workers wait for them. A search's plan is open until the
+            search ends; a sweep's plan is closed.
+        cancelled: the ids of runs that workers must stop.
     """
 
     name: str
@@ -79,75 +80,76 @@ class Plan:
     open: bool = False
     cancelled: tuple[str, ...] = ()
 
-    def of_variants(self, labels: Iterable[str]) -> Plan:
-        """Return the part of the plan that variants with these labels need, with their prerequisites."""
+    def select_variants(self, labels: Iterable[str]) -> Plan:
+        """Return a plan with only the variants with these labels, and the tasks that they need."""
         chosen = set(labels)
         entries = tuple(entry for entry in self.entries if entry.label in chosen)
         wanted = {entry.key for entry in entries}
-        for task in reversed(self.tasks):  # each before those that it needs, whose keys are their ids
+        for task in reversed(
+            self.tasks
+        ):  # backwards: a task comes after its prerequisite; a prerequisite's key is its id
             if task.key in wanted and task.prerequisite:
                 wanted.add(task.prerequisite)
         return replace(self, entries=entries, tasks=tuple(task for task in self.tasks if task.key in wanted))
 
     def run(self, label: str, seed: int) -> Run | None:
-        """Return the run of a variant with a seed, finished or not; None if its identity is not known."""
-        found = self._by_entry.get((label, seed))
+        """Return the run of a variant with a seed; None if the plan does not have it."""
+        found = self._run_ids.get((label, seed))
         return Run.from_id(self.outputs, found) if found else None
 
     @cached_property
-    def _by_entry(self) -> dict[tuple[str, int], str]:
+    def _run_ids(self) -> dict[tuple[str, int], str]:
         return {(entry.label, entry.seed): entry.id for entry in self.entries}
 
-    def run_of(self, task: RunTask | Entry) -> Run:
+    def get_run(self, task: RunTask | Entry) -> Run:
         """Return the run of a task or entry."""
         return Run.from_id(self.outputs, task.id)
 
-    def complete(self, task: RunTask | Entry) -> bool:
-        """Return whether the run is trained and has all wanted stages."""
-        run = self.run_of(task)
+    def is_complete(self, task: RunTask | Entry) -> bool:
+        """Return whether the run is trained and has all required stages."""
+        run = self.get_run(task)
         return run.done and all(map(run.has, task.stages))
 
-    def states(self, before: Mapping[str, str] | None = None) -> dict[str, str]:
-        """Return the state of every task by its key: its run's, or "blocked" if a prerequisite run failed.
+    def read_states(self, before: Mapping[str, str] | None = None) -> dict[str, str]:
+        """Return the state of each task's run by the task's key; "blocked" if a prerequisite run failed.
 
         Args:
-            before: states found earlier; tasks that were done then are taken to be done, without a look at
-                their runs.
+            before: earlier states. Tasks that were done then are not read again.
         """
         known = {key for key, state in (before or {}).items() if state == "done"}
         found = {}
         for task in self.tasks:
-            found[task.key] = "done" if task.key in known else self.run_of(task).state(self.complete(task))
-        return self.with_blocked(found)
+            found[task.key] = (
+                "done" if task.key in known else self.get_run(task).state(self.is_complete(task))
+            )
+        return self.mark_blocked(found)
 
-    def with_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
-        """Return the states with "blocked" for tasks that have a failed prerequisite."""
+    def mark_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
+        """Return the states, with "blocked" for each task after a failed prerequisite."""
         found = dict(states)
         for task in self.tasks:  # prerequisites come first
             if found[task.key] != "done" and found.get(task.prerequisite or "") in ("failed", "blocked"):
                 found[task.key] = "blocked"
         return found
 
-    def left(self, states: Mapping[str, str] | None = None) -> list[RunTask]:
-        """Return the tasks that are still to be done.
-
-        Tasks that are done, failed, blocked or cancelled are left out.
+    def list_remaining(self, states: Mapping[str, str] | None = None) -> list[RunTask]:
+        """Return all tasks except tasks that are done, failed, blocked or cancelled.
 
         Args:
-            states: the tasks' states; by default they are looked up.
+            states: the tasks' states; by default, they are read from the run folders.
         """
-        states = self.states() if states is None else states
+        states = self.read_states() if states is None else states
         ended = ("done", "failed", "blocked")
         return [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
 
     def save(self, path: Path) -> None:
-        """Write the plan to a file, completely or not at all."""
+        """Write the plan to a file atomically."""
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, {**asdict(self), "outputs": str(self.outputs)})
 
     @classmethod
     def load(cls, path: Path) -> Plan:
-        """Read a saved plan. Raises InputError if the file is not a plan."""
+        """Read a saved plan. Raises InputError for another file."""
         try:
             content = json.loads(path.read_bytes())
             for name, kind in (("entries", Entry), ("tasks", RunTask)):
@@ -157,40 +159,46 @@ class Plan:
             content["cancelled"] = tuple(content["cancelled"])
             return cls(**{**content, "outputs": Path(content["outputs"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: not a sweep's plan ({error}); start the sweep again") from None
+            raise InputError(
+                f"{path}: must be the plan of a sweep ({error}); start the sweep again"
+            ) from None
 
 
-def unique(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:
-    """Return each task once, in the given order, and prerequisites right before the first that needs them."""
+def order_tasks(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:
+    """Remove duplicate tasks, and move each prerequisite directly before the first task that needs it."""
     known = {task.key: task for task in tasks}
     order = (key for task in known.values() for key in (task.prerequisite, task.key) if key in known)
     return tuple(known[key] for key in dict.fromkeys(order))
 
 
 class Forecast(NamedTuple):
-    """The time that one worker would need for the remaining runs.
+    """An estimate of the time that one worker needs for the remaining runs.
 
     Attributes:
-        seconds: the time, seconds.
-        finished: how many finished runs the estimate comes from.
+        seconds: the time in seconds.
+        finished: the number of finished runs from which the time is estimated.
     """
 
     seconds: float
     finished: int
 
 
-def forecast(plan: Plan) -> Forecast | None:
-    """Estimate each remaining run from the finished runs of its variant, else from those of its kind.
+def estimate_time(plan: Plan) -> Forecast | None:
+    """Estimate the time of the remaining runs from finished runs.
+
+    A run is estimated by the mean over its variant's finished runs, else over all finished runs of its kind.
 
     Returns:
-        None if nothing is left, or if no run of the kinds that are left has finished.
+        None if no run remains, or if a remaining kind of run has no finished run.
     """
-    left = plan.left()
-    unfinished = {task.id for task in left}  # the time of a trained run may lack that of an evaluation
+    left = plan.list_remaining()
+    unfinished = {
+        task.id for task in left
+    }  # a trained run without all evaluations has not recorded their time
     times: dict[str, float] = {}
     kinds: dict[str, list[str]] = defaultdict(list)
     for task in plan.tasks:
-        if task.id not in unfinished and (seconds := run_seconds(plan.run_of(task))) is not None:
+        if task.id not in unfinished and (seconds := read_run_seconds(plan.get_run(task))) is not None:
             times[task.id] = seconds
             kinds[task.kind].append(task.id)
     if not left or not all(kinds[task.kind] for task in left):
@@ -205,7 +213,7 @@ def forecast(plan: Plan) -> Forecast | None:
     return Forecast(total, len(used))
 
 
-def run_seconds(run: Run) -> float | None:
-    """Return how long a finished run took, all stages together; None if it has not finished."""
+def read_run_seconds(run: Run) -> float | None:
+    """Return the total seconds of all stages of a finished run; None for an unfinished run."""
     found = run.manifest.get("seconds") if run.done else None
     return sum(found.values()) if isinstance(found, dict) else found

@@ -1,4 +1,4 @@
-"""The live table of a sweep: variants by seeds, what is done, running and waiting, and why runs failed."""
+"""The live table of a sweep: the state of each variant and seed, and the reasons of failures."""
 
 from __future__ import annotations
 
@@ -27,18 +27,19 @@ STATE_NAMES = {
     "new": "waiting", "trained": "trained, unfinished",
     "stopped": "waiting, started", "lost": "lost, to be taken over",
 }  # fmt: skip
-VARIANT_WIDTH = 20  # columns that a variant's name has at least, or as many as it needs
-QUIET = 300.0  # seconds without a line, in a log, after which the progress of the running runs is printed
+VARIANT_WIDTH = 20  # the minimum width of the variants' column, unless all labels are shorter
+QUIET = 300.0  # seconds without a line in a log before the progress of running runs is printed
 
 
 class Screen:
-    """Shows content that changes: in place on a terminal, elsewhere as one line for every change.
+    """Shows changing content: in place on a terminal, otherwise as one line for each change.
 
-    At the beginning, and where nothing changes for long, it prints lines about the running runs.
+    Without a terminal, it also prints lines about running runs, at the start and after QUIET seconds without
+    a change.
     """
 
     last_line: float | None = None
-    """When the last line was printed, by time.monotonic."""
+    """The time of the last printed line, by time.monotonic; None before the first line."""
 
     def __init__(self, console: Console | None = None):
         self.console = console or Console(highlight=False, stderr=True)
@@ -55,68 +56,75 @@ class Screen:
 
     def show(
         self,
-        whole: Callable[[], RenderableType],
+        render_all: Callable[[], RenderableType],
         count: str,
         changes: Sequence[str],
-        progress: Callable[[], Sequence[str]],
+        describe_running: Callable[[], Sequence[str]],
     ) -> None:
-        """Show the whole content on a terminal; elsewhere print the lines about what changed.
+        """Show the whole content on a terminal; otherwise print the changes.
 
-        `whole` and `progress` are called only if their results are shown. `count` precedes each line.
+        Args:
+            render_all: returns the whole content; called only on a terminal.
+            count: text before each line, such as "3 of 9 done".
+            changes: a line for each change since the last call.
+            describe_running: returns lines about running runs; called only if they are printed.
         """
         if self.console.is_terminal:
-            self.live.update(whole())
+            self.live.update(render_all())
             return
         now = time.monotonic()
         if not changes and (self.last_line is None or now - self.last_line >= QUIET):
-            changes = progress() or ["workers are starting"]
+            changes = describe_running() or ["workers are starting"]
         for line in changes:
             self.console.print(f"{count}; {line}", soft_wrap=True, markup=False)
             self.last_line = now
 
 
-def titled_table(title: str) -> Table:
+def make_titled_table(title: str) -> Table:
     """Return an empty table with a title."""
     return Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
 
 
 class Board(Screen):
-    """Shows the state of a plan: variants by seeds."""
+    """Shows a plan as a table of variants by seeds."""
 
     before: Mapping[str, str] | None = None
 
     def update(self, plan: Plan, states: Mapping[str, str]) -> None:
-        """Show the plan with its tasks in these states."""
+        """Show the plan with these states of its tasks."""
         done = f"{sum(state == 'done' for state in states.values())} of {len(states)} done"
         changed = [
             task for task in plan.tasks if self.before and self.before.get(task.key) != states[task.key]
         ]
         changes = [_describe_change(plan, task, states[task.key]) for task in changed]
 
-        def progress() -> list[str]:
+        def describe_running() -> list[str]:
             return [
-                f"{task_name(plan, task)}: {progress_text(plan.run_of(task), total_steps(task))}"
+                f"{describe_task(plan, task)}: {describe_progress(plan.get_run(task), count_steps(task))}"
                 for task in plan.tasks
                 if states[task.key] == "running"
             ]
 
-        self.show(lambda: render(plan, states), done, changes, progress)
+        self.show(lambda: render(plan, states), done, changes, describe_running)
         self.before = states
 
 
 def _describe_change(plan: Plan, task: RunTask, state: str) -> str:
-    run = plan.run_of(task)
+    run = plan.get_run(task)
     reason = run.failure if state == "failed" else None
-    return f"{task_name(plan, task)}: {STATE_NAMES.get(state, state)}{f', {reason}' if reason else ''}"
+    return f"{describe_task(plan, task)}: {STATE_NAMES.get(state, state)}{f', {reason}' if reason else ''}"
 
 
-def task_name(plan: Plan, task: RunTask) -> str:
-    """Return the task's readable name: variant and seed, or kind of run and the seeds that need it."""
+def describe_task(plan: Plan, task: RunTask) -> str:
+    """Return a task's readable name.
+
+    It is the variant and the seed; for a prerequisite run, the kind, the id and the seeds that need it.
+    """
     for entry in plan.entries:
         if entry.key == task.key:
             return f"{entry.label} seed {entry.seed}"
     users = {task.id}
-    for other in plan.tasks:  # each after those that it needs
+    for other in plan.tasks:  # a task comes after its prerequisite
         users |= {other.id} if other.prerequisite in users else set()
     seeds = sorted({entry.seed for entry in plan.entries if entry.id in users})
     of_seeds = f" of seed {', '.join(map(str, seeds))}" if seeds else ""
@@ -124,10 +132,10 @@ def task_name(plan: Plan, task: RunTask) -> str:
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:
-    """Draw variants by seeds, prerequisite runs, the counts of states, and the reasons of failures."""
+    """Return the table of variants by seeds, with prerequisite runs, counts and failures below it."""
     tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
-    table = titled_table(f"sweep {plan.name}")
+    table = make_titled_table(f"sweep {plan.name}")
     labels = list(dict.fromkeys(entry.label for entry in plan.entries))
     width = min(VARIANT_WIDTH, max(map(len, labels), default=0))
     table.add_column("variant", overflow="fold", min_width=width)
@@ -135,49 +143,51 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
         table.add_column(f"seed {seed}")
     for label in labels:
         cells = {
-            e.seed: state_text(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label
+            e.seed: format_state(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label
         }
         table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
     below = [
-        Text(f"{task_name(plan, task)}: ") + state_text(plan, task, states[task.key])
+        Text(f"{describe_task(plan, task)}: ") + format_state(plan, task, states[task.key])
         for task in plan.tasks
         if task.kind != NETWORK
     ]
     counts = Counter(STATE_NAMES.get(state, state).partition(",")[0] for state in states.values())
     below.append(Text(", ".join(f"{count} {state}" for state, count in counts.items())))
-    if any(states[task.key] == "done" and result(plan.run_of(task)) for task in plan.tasks):
-        below.append(Text("cm: done; MPJPE in stream mode of the rotation branch, a table may show another"))
+    if any(states[task.key] == "done" and format_result(plan.get_run(task)) for task in plan.tasks):
+        below.append(
+            Text("cm: done; MPJPE of the rotation branch in stream mode (tables may show other branches)")
+        )
     below += [
-        Text(f"{task_name(plan, task)}: {plan.run_of(task).failure}", style="red")
+        Text(f"{describe_task(plan, task)}: {plan.get_run(task).failure}", style="red")
         for task in plan.tasks
         if states[task.key] == "failed"
     ]
     return Group(table, *below)
 
 
-def state_text(plan: Plan, task: RunTask, state: str) -> Text:
-    """Describe a run in a few characters."""
-    run, style = plan.run_of(task), COLOURS.get(state, "")
+def format_state(plan: Plan, task: RunTask, state: str) -> Text:
+    """Return a short text for the state of a task's run."""
+    run, style = plan.get_run(task), COLOURS.get(state, "")
     if state == "running":
-        return Text(progress_text(run, total_steps(task)), style=style)
+        return Text(describe_progress(run, count_steps(task)), style=style)
     if state == "done":
-        return Text(result(run) or state, style=style)
+        return Text(format_result(run) or state, style=style)
     return Text(STATE_NAMES.get(state, state), style=style)
 
 
-def result(run: Run) -> str:
-    """Return the stream-mode MPJPE of a finished run, rotation branch, as text; empty if not measured."""
+def format_result(run: Run) -> str:
+    """Return the rotation branch's stream-mode MPJPE as text; empty if it was not measured."""
     value = run.results.get("stream", {}).get("rotation", {}).get("MPJPE")
     return f"{value:.2f} cm" if isinstance(value, int | float) else ""
 
 
-def total_steps(task: RunTask) -> int:
-    """Return the number of steps of the task's training."""
+def count_steps(task: RunTask) -> int:
+    """Return the number of training steps of a task."""
     return int(find_training_settings(task.kind, task.config)["steps"])
 
 
-def progress_text(run: Run, total: int) -> str:
-    """Describe a run that a process is working on: steps of its training, remaining time and loss."""
+def describe_progress(run: Run, total: int) -> str:
+    """Return a running run's training steps, remaining time and loss as text."""
     if (doing := run.activity) in ("evaluating", "exporting"):
         return doing
     log = [entry for entry in run.metrics() if entry.phase == "train"]
@@ -185,17 +195,18 @@ def progress_text(run: Run, total: int) -> str:
         return "starting"
     if log[-1].step >= total:
         return "evaluating"
-    seconds = time_left(log, total)
+    seconds = estimate_time_left(log, total)
     left = ""
     if seconds is not None:
         left = f" {seconds / 60:.0f} min" if seconds >= 90 else f" {seconds:.0f} s"
     return f"{log[-1].step}/{total}{left} loss {log[-1].values['loss']:.3g}"
 
 
-def time_left(log: list[LogRecord], total: int) -> float | None:
-    """Return the seconds to the end of training, at the rate of the log's last five entries.
+def estimate_time_left(log: list[LogRecord], total: int) -> float | None:
+    """Estimate the remaining seconds of training from the log's last five entries.
 
-    Return None if there is no rate yet.
+    Returns:
+        None before there are two entries at different steps.
     """
     recent = log[-5:]
     steps, seconds = recent[-1].step - recent[0].step, recent[-1].time - recent[0].time

@@ -1,20 +1,20 @@
 """Sweep files: variants (each with a label and overrides of the base), seeds, and the paper's values.
 
 title: Placement of memory blocks in the backbone
-table: 14                          # the number in the paper; left out in sweeps of your own
+table: 14                          # the table's number in the paper; omitted in custom sweeps
 base: [experiment=paper]           # overrides that all variants share
 seeds: [0, 1, 2]
-control: 2, 4, 6, 8                # the variant that the others are compared with; the first one by default
+control: 2, 4, 6, 8                # the variant with which all others are compared; by default, the first
 metrics: [MPJRE, MPJPE, MPJVE, Jitter]
-branch: combined                   # whose errors the rows show: rotation (the default), position or combined
-branch_source: its last row is Table 6's after inverse kinematics    # how we know the paper's branch
-smallest: {MPJPE: 0.1}             # the smallest effect of interest by metric; SMALLEST has the defaults
+branch: combined                   # the branch that rows show: rotation (default), position or combined
+branch_source: its last row is Table 6's after inverse kinematics    # evidence for the paper's branch
+smallest: {MPJPE: 0.1}             # the smallest effect of interest by metric; defaults are in SMALLEST
 variants:
   2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
   "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
   "4": {overrides: ['memory.layers=[4]'], branch: rotation, against: "2"}     # its own branch and control
-axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of variants or over each of them
-axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or a list of grids: the cells of all
+axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, in which each variant is repeated
+axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or several grids
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from memmlp.sweep.definition import (
     COSTS,
     Sweep,
     Variant,
-    key_of,
     parse_branch,
+    parse_key,
     parse_seeds,
 )
 
@@ -48,18 +48,20 @@ KEYS = (
     "variants", "axes",
 )  # fmt: skip
 VARIANT_KEYS = ("overrides", "branch", "against", "paper", "note")
-BASE = "base"  # the variant of a sweep that has only seeds
+BASE = "base"  # the variant's label in a sweep without variants and grids
 
 
 class UniqueKeys(yaml.SafeLoader):
-    """A safe YAML loader that rejects duplicate keys; plain YAML silently takes the last one."""
+    """A safe YAML loader that rejects duplicate keys. PyYAML's own silently takes the last value."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return the mapping. Raises ConstructorError for a key that occurs twice."""
+        """Return the mapping. Raises ConstructorError for a duplicate key."""
         seen = set()
         for key, _ in node.value:
             if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"duplicate key '{key.value}'", key.start_mark
+                )
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -69,17 +71,17 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
 
     Args:
         path: the file.
-        prepare: gets the base before the rest is checked, since the rest may name custom metrics.
+        prepare: called with the base before the other keys are checked, because they may name custom metrics.
 
     Raises:
-        InputError: if something is wrong; the message names file and key.
+        InputError: for invalid content; the message names the file and the key.
     """
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
     except OSError as error:
         raise InputError(f"{path}: {describe_read_error(error)}; expected a readable sweep file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not YAML: {describe_read_error(error)}") from None
+        raise InputError(f"{path}: expected YAML ({describe_read_error(error)})") from None
     try:
         base = content.get("base") if isinstance(content, Mapping) else None
         prepare([text for text in base if isinstance(text, str)] if isinstance(base, list) else [])
@@ -89,90 +91,96 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
 
 
 def parse_sweep(name: str, content: Any) -> Sweep:
-    """Return the sweep that a file's content describes. Raises InputError, which names the key."""
-    content = _mapping(content, "the file", KEYS)
+    """Return the sweep that a file's content describes. Raises InputError for invalid content."""
+    content = _parse_mapping(content, "the file", KEYS)
     branch = parse_branch(content.get("branch", BRANCHES[0]), "branch")
-    variants = _variants(content.get("variants", {}), branch)
-    grids, seeds = _axes(content)
+    variants = _parse_variants(content.get("variants", {}), branch)
+    grids, seeds = _parse_axes(content)
     if "axes" in content and not variants:
-        variants = [Variant("" if grids else BASE, branch=branch)]  # only seeds as axes
-    variants = list(_over_cells(variants, _cells(grids))) if grids else variants
+        variants = [
+            Variant("" if grids else BASE, branch=branch)
+        ]  # no variants, and perhaps only a seed axis
+    variants = list(_repeat_in_cells(variants, _list_cells(grids))) if grids else variants
     runnable = [variant.label for variant in variants if variant.overrides is not None]
     if not runnable:
-        raise InputError("variants: expected at least one with overrides, or axes")
+        raise InputError("variants: expected at least one variant with overrides, or axes")
     control = str(content.get("control", runnable[0]))
     if control not in runnable:
         raise InputError(f"control: '{control}'; expected one of {', '.join(map(repr, runnable))}")
     for variant in variants:
         if variant.against is not None and variant.against not in {*runnable} - {variant.label}:
             raise InputError(
-                f"variants.{variant.label}.against: '{variant.against}'; expected another one with overrides"
+                f"variants.{variant.label}.against: '{variant.against}'; "
+                "expected another variant with overrides"
             )
     table = content.get("table")
     if table is not None and (isinstance(table, bool) or not isinstance(table, int) or table < 1):
         raise InputError(f"table: {table!r}; expected the number of a table of the paper")
-    metrics = _texts(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"]), "metrics")
+    metrics = _parse_texts(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"]), "metrics")
     if not metrics or not {*metrics} <= {*UNITS, *COSTS}:
         raise InputError(f"metrics: {metrics}; expected a list of {', '.join([*UNITS, *COSTS])}")
-    smallest = _numbers(content.get("smallest", {}), "smallest", [*UNITS])
+    smallest = _parse_numbers(content.get("smallest", {}), "smallest", [*UNITS])
     for metric, number in smallest.items():
         if not 0 < number < math.inf:
             raise InputError(f"smallest.{metric}: {number!r}; must be above 0")
     source = content.get("branch_source")
     return Sweep(
         name=name,
-        title=_text(content.get("title", name), "title"),
+        title=_parse_text(content.get("title", name), "title"),
         table=table,
-        notes=tuple(_texts(content.get("notes", []), "notes")),
-        base=tuple(_overrides(content.get("base", []), "base")),
+        notes=tuple(_parse_texts(content.get("notes", []), "notes")),
+        base=tuple(_parse_overrides(content.get("base", []), "base")),
         seeds=seeds,
         variants=tuple(variants),
         control=control,
         metrics=tuple(metrics),
-        branch_source=None if source is None else _text(source, "branch_source"),
+        branch_source=None if source is None else _parse_text(source, "branch_source"),
         smallest=SMALLEST | smallest,
     )
 
 
-def _variants(value: Any, branch: str) -> list[Variant]:
-    # A label that YAML reads as a number becomes text.
-    variants = [_variant(str(label), fields, branch) for label, fields in _mapping(value, "variants").items()]
+def _parse_variants(value: Any, branch: str) -> list[Variant]:
+    # YAML may have read a label as a number.
+    variants = [
+        _parse_variant(str(label), fields, branch)
+        for label, fields in _parse_mapping(value, "variants").items()
+    ]
     if len({variant.label for variant in variants}) < len(variants):
-        raise InputError("variants: two have the same label")
+        raise InputError("variants: two variants have the same label")
     for variant in variants:
         if not variant.label.isprintable():
-            raise InputError(f"variants: {variant.label!r}; expected a label of one line")
+            raise InputError(f"variants: {variant.label!r}; expected a label in one line")
     return variants
 
 
-def _variant(label: str, value: Any, branch: str) -> Variant:
+def _parse_variant(label: str, value: Any, branch: str) -> Variant:
     name = f"variants.{label}"
     if isinstance(value, list):
-        return Variant(label, tuple(_overrides(value, name)), branch)
-    value = _mapping(value or {}, name, VARIANT_KEYS)
+        return Variant(label, tuple(_parse_overrides(value, name)), branch)
+    value = _parse_mapping(value or {}, name, VARIANT_KEYS)
     overrides = value.get("overrides", [])
     return Variant(
         label,
-        None if overrides is None else tuple(_overrides(overrides, f"{name}.overrides")),
+        None if overrides is None else tuple(_parse_overrides(overrides, f"{name}.overrides")),
         parse_branch(value.get("branch", branch), f"{name}.branch"),
-        _numbers(value.get("paper", {}), f"{name}.paper", [*UNITS, *COSTS]),
+        _parse_numbers(value.get("paper", {}), f"{name}.paper", [*UNITS, *COSTS]),
         value.get("note"),
         str(value["against"]) if value.get("against") is not None else None,
         "branch" in value,
     )
 
 
-def _axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple[int, ...]]:
-    """Return the grids of the axes, none of them empty, and the sweep's seeds.
+def _parse_axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple[int, ...]]:
+    """Return the grids of the axes that are not empty, and the sweep's seeds.
 
-    Seeds may be an axis of a single grid.
+    A single grid may have seeds as an axis.
     """
     axes = content.get("axes", {})
     several = isinstance(axes, list)
     if several and not axes:
         raise InputError("axes: empty; expected a mapping of keys, or a list of such mappings")
     named = [(f"axes[{place}]", grid) for place, grid in enumerate(axes)] if several else [("axes", axes)]
-    grids = [(name, dict(_mapping(grid, name))) for name, grid in named]
+    grids = [(name, dict(_parse_mapping(grid, name))) for name, grid in named]
     seeds = content.get("seeds", [0])
     if not several:
         seeds = grids[0][1].pop("seed", seeds)
@@ -181,13 +189,13 @@ def _axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple
             raise InputError(f"{name}: empty; expected a mapping of at least one key")
         for key, values in grid.items():
             if several and str(key) == "seed":
-                raise InputError(f"{name}.seed: the seeds of several grids are set by the key seeds")
+                raise InputError(f"{name}.seed: expected the key seeds for several grids")
             if not isinstance(values, list) or not values:
                 raise InputError(f"{name}.{key}: expected a list of values")
     return [grid for _, grid in grids if grid], parse_seeds(seeds, "seeds")
 
 
-def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]]:
+def _list_cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]]:
     found: dict[frozenset[str], tuple[str, ...]] = {}
     for grid in grids:
         for values in itertools.product(*grid.values()):
@@ -196,19 +204,21 @@ def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]
     return list(found.values())
 
 
-def _over_cells(variants: Sequence[Variant], cells: Sequence[tuple[str, ...]]) -> Iterable[Variant]:
-    """Yield every variant in every cell.
+def _repeat_in_cells(variants: Sequence[Variant], cells: Sequence[tuple[str, ...]]) -> Iterable[Variant]:
+    """Yield each variant in each cell of the grids.
 
-    Rows with only the paper's values stay as they are. A variant without a label gets its cell's overrides as
-    label. A variant with a control of its own is compared with that control in the same cell.
+    A cell's overrides are appended to the variant's label. A variant's own control becomes the control in the
+    same cell. Rows with only the paper's values are not repeated.
     """
-    axes = {key_of(text) for cell in cells for text in cell}
+    axes = {parse_key(text) for cell in cells for text in cell}
     for variant in variants:
         if variant.overrides is None:
             yield variant
             continue
-        if both := sorted(axes & {key_of(text) for text in variant.overrides}):
-            raise InputError(f"variant '{variant.label}': sets {both[0]}, which is an axis; keep one of both")
+        if both := sorted(axes & {parse_key(text) for text in variant.overrides}):
+            raise InputError(
+                f"variant '{variant.label}': sets {both[0]}, which is also an axis; remove one of them"
+            )
         for cell in cells:
             yield replace(
                 variant,
@@ -220,9 +230,9 @@ def _over_cells(variants: Sequence[Variant], cells: Sequence[tuple[str, ...]]) -
             )
 
 
-def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, Any]:
+def _parse_mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise InputError(f"{name}: {_shown(value)}; expected a mapping")
+        raise InputError(f"{name}: {_show_value(value)}; expected a mapping")
     for key in value:
         if keys and key not in keys:
             near = difflib.get_close_matches(str(key), keys, n=1)
@@ -232,36 +242,36 @@ def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, An
     return value
 
 
-def _overrides(value: Any, name: str) -> list[str]:
-    """Return a list of Hydra overrides, checked for their form only; composing them checks their meaning."""
-    texts = _texts(value, name)
+def _parse_overrides(value: Any, name: str) -> list[str]:
+    """Return a list of Hydra overrides. Only their syntax is checked; composing checks keys and values."""
+    texts = _parse_texts(value, name)
     for text in texts:
         if not re.match(r"[+~]*[\w./@]+(=|$)", text):
             raise InputError(f"{name}: '{text}'; expected KEY=VALUE or GROUP=OPTION")
-        if key_of(text) == "seed":
-            raise InputError(f"{name}: '{text}'; the seeds are set by the key seeds")
+        if parse_key(text) == "seed":
+            raise InputError(f"{name}: '{text}'; expected the key seeds for seeds")
     return texts
 
 
-def _texts(value: Any, name: str) -> list[str]:
+def _parse_texts(value: Any, name: str) -> list[str]:
     if not isinstance(value, list):
-        raise InputError(f"{name}: {_shown(value)}; expected a list of texts")
-    return [_text(item, name) for item in value]
+        raise InputError(f"{name}: {_show_value(value)}; expected a list of texts")
+    return [_parse_text(item, name) for item in value]
 
 
-def _text(value: Any, name: str) -> str:
+def _parse_text(value: Any, name: str) -> str:
     if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{name}: {_shown(value)}; expected text")
+        raise InputError(f"{name}: {_show_value(value)}; expected text")
     return value
 
 
-def _numbers(value: Any, name: str, keys: Sequence[str]) -> dict[str, float]:
-    values = dict(_mapping(value or {}, name, keys))
+def _parse_numbers(value: Any, name: str, keys: Sequence[str]) -> dict[str, float]:
+    values = dict(_parse_mapping(value or {}, name, keys))
     for metric, number in values.items():
         if not isinstance(number, int | float) or isinstance(number, bool):
             raise InputError(f"{name}.{metric}: {number!r}; expected a number")
     return values
 
 
-def _shown(value: Any) -> str:
+def _show_value(value: Any) -> str:
     return "nothing" if value is None else f"{value!r}"[:60]

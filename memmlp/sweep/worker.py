@@ -1,8 +1,8 @@
-"""A worker takes a plan's tasks, one after another, each under its run's lease, until none is left.
+"""A worker performs a plan's tasks, one after another, each under its run's lease, until no task remains.
 
-Any number of workers, on any machines that share the outputs folder, may work on the same runs. A run is
-finished by one of them. When a worker is killed, or stands still for longer than its lease, another worker
-takes over its run from the last checkpoint. What a worker does with a task is in `config/worker_process.py`.
+Several workers, also on several machines that share the outputs folder, may work on the same plan. Only one
+worker at a time works on a run. If a worker is killed, or hangs for longer than its lease, another worker
+continues the run from the last checkpoint. `config/worker_process.py` performs a single task.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from memmlp.common.lease import ChangeTimer, current_process, is_alive
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
-PAUSE = 0.5  # seconds between two looks at a plan while other workers do its tasks
-ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
-DEATHS = 10  # workers that died at the same step of a run before it counts as failed
+PAUSE = 0.5  # seconds between two reads of a plan while other workers perform its tasks
+ABANDONED = 600.0  # seconds without a change of an open plan's file before its controller counts as dead
+MAX_DEATHS = 10  # number of workers that may die at the same step before the run counts as failed
 
 _changes = ChangeTimer()
 
@@ -29,69 +29,69 @@ Perform = Callable[[Plan, RunTask], None]
 
 
 class Cancelled(Exception):
-    """Raised when the plan no longer wants the run; its folder stays as it is, and can be resumed."""
+    """Raised when the plan cancels a run. The run's folder is kept, so the run can be resumed."""
 
 
-def work_off(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: True) -> None:
-    """Work on the plan in a file while `wanted` returns true and tasks are left.
+def work_on_plan(path: Path, perform: Perform, should_continue: Callable[[], bool] = lambda: True) -> None:
+    """Perform the tasks of the plan in a file until no task remains.
 
-    The file is read again before each task, since the plan may have changed. An open plan (a search's) may
-    get more tasks, so its workers stay.
+    The file is read again before each task, because the plan may have changed. An open plan may get more
+    tasks, so its workers wait for them.
 
     Args:
         path: the plan's file.
-        perform: brings a task's run to its end, or raises.
-        wanted: whether to go on.
+        perform: finishes a task's run, or raises an exception.
+        should_continue: returns whether to go on; called before each task.
     """
     states: Mapping[str, str] = {}
-    while wanted():
+    while should_continue():
         plan = Plan.load(path)
-        left = plan.left(states := plan.states(states))
+        left = plan.list_remaining(states := plan.read_states(states))
         if not left and not plan.open:
             return
-        if not any(attempt(plan, task, perform) for task in left):
+        if not any(try_task(plan, task, perform) for task in left):
             time.sleep(PAUSE)
 
 
 def has_controller(path: Path) -> bool:
-    """Return whether the plan in a file is closed, or is open and has a living controller.
+    """Return whether a plan is closed, or is open and its controller is alive.
 
-    A living controller touches the file repeatedly. The time for which this process has seen the file
-    untouched decides, since the controller's machine may have another clock.
+    A living controller touches the plan's file repeatedly. The interval since the last change is measured
+    with this process' clock, because the clock of the controller's machine may differ.
     """
     if not Plan.load(path).open:
         return True
     return _changes.seconds_unchanged(path, lambda: path.stat().st_mtime_ns) < ABANDONED
 
 
-def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
-    """Finish a task's run, if its prerequisite is done and no other process works on it.
+def try_task(plan: Plan, task: RunTask, perform: Perform) -> bool:
+    """Finish a task's run if its prerequisite is done and no other process works on the run.
 
-    A failure is recorded with the run, and does not affect the other tasks.
+    A failure is recorded in the run's folder, and does not affect other tasks.
 
     Returns:
-        False if the task has to wait for its prerequisite or for another worker; else True.
+        Whether the run was free to work on: False if its prerequisite or another process blocks it.
 
     Raises:
         OSError: if the disk is full or read-only, which affects every task.
     """
-    run = plan.run_of(task)
+    run = plan.get_run(task)
     if task.prerequisite and not Run.from_id(plan.outputs, task.prerequisite).done:
         return False
     with run.lock(wait=False) as mine:
         if not mine:
             return False
         try:
-            if not plan.complete(task) and not run.failure:  # unless another process has ended it
-                _perform(plan, task, run, perform)
+            if not plan.is_complete(task) and not run.failure:  # another process may have ended it
+                _finish_run(plan, task, run, perform)
         except LeaseLost as lost:
             print(f"memmlp: {lost}", file=sys.stderr, flush=True)
     return True
 
 
-def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
-    if count_deaths(run) >= DEATHS:
-        run.fail(f"{DEATHS} processes died at step {run.step} of it, one after another")
+def _finish_run(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
+    if count_deaths(run) >= MAX_DEATHS:
+        run.fail(f"{MAX_DEATHS} processes in a row died at step {run.step}")
         return
     try:
         perform(plan, task)
@@ -108,9 +108,9 @@ def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
 
 
 def count_deaths(run: Run) -> int:
-    """Count how many processes, one after another, most recently started the run at its present step.
+    """Count the latest processes in a row that started the run at its current step.
 
-    Those before work that ended well, or before the last --retry, don't count.
+    Processes before successful work, or before the last --retry, are not counted.
     """
     step, count, manifest = run.step, 0, run.manifest
     for start in reversed(manifest.get("attempts", [])[manifest.get("forgiven", 0) :]):
@@ -121,7 +121,7 @@ def count_deaths(run: Run) -> int:
 
 
 class Presence:
-    """A sign that the process which made it is alive: a file that names the process and its machine."""
+    """A file that names a process and its machine, from which others see whether the process is alive."""
 
     def __init__(self, path: Path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -129,7 +129,7 @@ class Presence:
         write_json(path, current_process())
 
     @staticmethod
-    def of(path: Path) -> bool:
-        """Return whether the process that made the file is alive, or may be alive on another machine."""
+    def is_alive(path: Path) -> bool:
+        """Return whether the process that wrote the file is alive, or may be alive on another machine."""
         process = read_json(path)
         return bool(process) and is_alive(process) is not False

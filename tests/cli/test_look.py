@@ -115,7 +115,7 @@ def test_eval_says_that_code_has_changed_since(
 
 def test_without_pyav_nothing_is_computed(memmlp: Memmlp, finished: Run, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    monkeypatch.delattr("memmlp.config.open_run.open_found")
+    monkeypatch.delattr("memmlp.config.open_run.open_existing_run")
     assert one_line(memmlp("render", finished.id, "--out", "a.mp4"), "memmlp[video]")
 
 

@@ -16,7 +16,7 @@ from processes import finished
 import memmlp as package
 from memmlp.cli.main import COMMANDS, main
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.config.plugins import packaged
+from memmlp.config.plugins import find_packaged_folder
 
 
 @pytest.fixture
@@ -250,4 +250,4 @@ def test_the_configs_are_found_beside_the_package_or_in_it(
     place = tmp_path / "memmlp" / "_conf" if installed else tmp_path / "conf"
     place.mkdir(parents=True)
     monkeypatch.setattr(package, "__file__", str(tmp_path / "memmlp" / "__init__.py"))
-    assert packaged("conf") == place
+    assert find_packaged_folder("conf") == place

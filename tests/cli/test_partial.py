@@ -12,7 +12,7 @@ import yaml
 from command_line import run
 
 from memmlp.config.build_request import build_motion
-from memmlp.config.compose import composed
+from memmlp.config.compose import compose_config
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.runs.lookup import list_runs
@@ -62,7 +62,7 @@ def test_a_missing_clip_stops_whatever_trains_with_one_line(home, command):
 
 def test_a_plan_that_was_made_for_a_look_is_no_way_round(home):
     with contextlib.chdir(home):
-        build_motion(composed([*S1, "data.split.val=0.2", "data.partial=true"])).prepare()
+        build_motion(compose_config([*S1, "data.split.val=0.2", "data.partial=true"])).prepare()
     words = ["sweep", "s1.yaml", *TINY, *S1]
     assert "prepared" not in run(home, *words, "--status")  # the plan is kept
     assert REFUSED in run(home, *words, "--workers", "1", code=2)

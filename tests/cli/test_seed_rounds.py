@@ -33,7 +33,9 @@ class Runs:
         return f"{label}{self.version}"
 
     def planned(self, sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-        cells = [(variant.label, seed) for variant in sweep.runnable() for seed in sweep.seeds_of(variant)]
+        cells = [
+            (variant.label, seed) for variant in sweep.list_runnable() for seed in sweep.get_seeds(variant)
+        ]
         entries = [Entry(label, seed, self._id(label, seed)) for label, seed in cells]
         tasks = [RunTask(entry.id, "memmlp", {"optim": {"steps": 1}, "device": "cpu"}) for entry in entries]
         return Plan(sweep.name, self.outputs, tuple(entries), tuple(tasks))
@@ -43,7 +45,7 @@ class Runs:
 
     def work(self, sweep: Sweep, plan: Plan, **settings: object) -> None:
         for entry in plan.entries:
-            if any(entry.id == task.id for task in plan.left()):
+            if any(entry.id == task.id for task in plan.list_remaining()):
                 self.make(entry)
 
     def make(self, entry: Entry) -> None:

@@ -19,11 +19,11 @@ from memmlp.cli.main import main
 from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep, make_plan
-from memmlp.config.worker_process import perform
+from memmlp.config.worker_process import perform_task
 from memmlp.runs.identity import VERSIONS, find_version
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
-from memmlp.sweep.progress_table import task_name
+from memmlp.sweep.progress_table import describe_task
 
 TINY = [*BRIEF, "export.graph=off"]
 VARIANTS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
@@ -132,7 +132,7 @@ def test_seeds_come_one_after_another_each_with_all_variants(home: Path, monkeyp
             other.id for other in plan.tasks[: plan.tasks.index(task)]
         ]
     (codes,) = (task for task in plan.tasks if task.kind == "vqvae" and task.id == plan.tasks[0].id)
-    assert task_name(plan, codes).startswith(f"VQ-VAE {codes.id} of seed ")
+    assert describe_task(plan, codes).startswith(f"VQ-VAE {codes.id} of seed ")
     said = command(home, "seed=1,0", "--status")
     assert re.search(r"variant +seed 0 +seed 1", said)
     assert re.search(r"none +[\d.]+ cm +waiting", said)
@@ -153,7 +153,7 @@ def test_again_does_networks_again_and_force_is_refused(
     copy = Path(shutil.copytree(home, tmp_path / "copy"))
     left = []
     monkeypatch.setattr(
-        "memmlp.cli.sweep.run_workers", lambda chosen, plan, **options: left.extend(plan.left())
+        "memmlp.cli.sweep.run_workers", lambda chosen, plan, **options: left.extend(plan.list_remaining())
     )
     command(copy, "--again")
     assert sorted(task.kind for task in left) == ["memmlp", "memmlp", "memmlp"]
@@ -263,9 +263,9 @@ def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeyp
     monkeypatch.chdir(home)
     plan = make_plan(find_sweep("trial.yaml").with_overrides(TINY), (home / "outputs").absolute())
     other = replace(next(task for task in plan.tasks if task.kind == "memmlp"), id="0" * 16)
-    with pytest.raises(InputError, match="the data or the code changed since the sweep began"):
-        perform(home / "plan.json", 1, plan, other)
-    assert not plan.run_of(other).folder.exists()
+    with pytest.raises(InputError, match="the data or the code has changed"):
+        perform_task(home / "plan.json", 1, plan, other)
+    assert not plan.get_run(other).folder.exists()
 
 
 def test_runs_with_another_component_version_are_missing(home: Path, monkeypatch: pytest.MonkeyPatch):

@@ -23,7 +23,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         if sweep.table == 1 or "bad=1" in sweep.command_line:
             raise InputError("data.root: has no value")
         find = fake_sweep(tmp_path / sweep.name, sweep, clips=CLIPS[-4:])
-        entries = [(variant, seed) for variant in sweep.runnable() for seed in sweep.seeds]
+        entries = [(variant, seed) for variant in sweep.list_runnable() for seed in sweep.seeds]
         found = [Entry(variant.label, seed, find(variant, seed).id) for variant, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 

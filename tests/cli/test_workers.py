@@ -95,6 +95,6 @@ def test_workers_know_whether_they_are_to_have_a_gpu(
     path, fleet = start_fleet(tmp_path, Plan("s", tmp_path, (), ()), Workers(executor, count=1), wanted)
     assert fleet.work.args[-1] is gpu
     monkeypatch.setattr(devices, "describe_missing_gpu", lambda: "none is there")
-    monkeypatch.setattr(worker_process, "work_off", lambda *_: None)
+    monkeypatch.setattr(worker_process, "work_on_plan", lambda *_: None)
     assert fleet.work() == ("none is there" if gpu else None)
     assert path.exists()

@@ -5,7 +5,7 @@ import tiny
 
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import composed
+from memmlp.config.compose import compose_config
 from memmlp.deploy import latency
 from memmlp.motion.normalizer import Normalizer
 
@@ -36,25 +36,25 @@ def test_paper_profile_has_the_published_size(name, monkeypatch):
     """Weights are counted, not drawn."""
     monkeypatch.setattr("torch.nn.Linear.reset_parameters", lambda layer: None)
     monkeypatch.setattr("torch.Tensor.normal_", lambda tensor, *_, **options: tensor.zero_())
-    architecture = build_experiment(composed([f"model={name}", "profile=paper"])).architecture
+    architecture = build_experiment(compose_config([f"model={name}", "profile=paper"])).architecture
     model = architecture.build(Normalizer.raw(architecture.coordinates, tiny.REST), None).eval()
     assert (model.count_parameters(), latency.count_macs(model)) == PUBLISHED[name]
 
 
 def test_baselines_see_what_their_authors_give_them():
     """World coordinates, and z-scores of the diffusion model and of RPM alone; what is asked for wins."""
-    features = {name: tuple(composed([f"model={name}"]).normalizer.values()) for name in NAMES}
+    features = {name: tuple(compose_config([f"model={name}"]).normalizer.values()) for name in NAMES}
     scored = dict.fromkeys(("agrol_diffusion", "rpm"), ("world", True))
     assert features == dict.fromkeys(NAMES, ("world", False)) | scored
-    asked = composed(
+    asked = compose_config(
         ["model=agrol_mlp", "normalizer.coordinates=heading", "normalizer.z_scores=true"]
     ).normalizer
     assert tuple(asked.values()) == ("heading", True)
-    assert tuple(composed([]).normalizer.values()) == ("heading", True)
+    assert tuple(compose_config([]).normalizer.values()) == ("heading", True)
 
 
 def identity(*overrides: str) -> str:
-    return build_experiment(composed(list(overrides))).identity("d").id
+    return build_experiment(compose_config(list(overrides))).identity("d").id
 
 
 @pytest.mark.slow
@@ -123,12 +123,12 @@ REFUSED = [
 def test_an_impossible_combination_is_one_line():
     for overrides, word in REFUSED:
         with pytest.raises(InputError) as refusal:
-            composed(overrides)
+            compose_config(overrides)
         assert word in str(refusal.value), overrides
         assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.slow
 def test_arms_that_a_refiner_has_moved_may_reach_again():
-    cfg = composed(["model=recurrent_poser", "refiner=sage", "evaluation.ik=arms"])
+    cfg = compose_config(["model=recurrent_poser", "refiner=sage", "evaluation.ik=arms"])
     assert (cfg.model.output, cfg.evaluation.ik) == ("reaching", "arms")

@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import composed
+from memmlp.config.compose import compose_config
 from memmlp.deploy.export import export
 from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.evaluation import modes as evaluation
@@ -73,7 +73,7 @@ ARMS: dict[str, Arm] = {}
 
 def trained(overrides: list[str]) -> Arm:
     """Two steps, a validation, and the first test clip evaluated as the config says; once for each config."""
-    cfg = composed(overrides)
+    cfg = compose_config(overrides)
     key = OmegaConf.to_yaml(cfg)
     if key not in ARMS:
         ARMS[key] = train_and_stream(cfg)
@@ -158,7 +158,7 @@ def test_every_kind_of_graph_exports(overrides, tmp_path):
 def network(overrides: list[str]) -> MemMLP:
     """The network of a command line, with random weights and codes."""
     torch.manual_seed(0)
-    architecture = build_experiment(composed(overrides)).architecture
+    architecture = build_experiment(compose_config(overrides)).architecture
     codes = architecture.vqvae() if architecture.uses_codes else None
     model = architecture.build(Normalizer.raw(architecture.coordinates, tiny.REST), codes)
     for name, buffer in model.named_buffers():
@@ -170,7 +170,7 @@ def network(overrides: list[str]) -> MemMLP:
 @pytest.mark.slow
 def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
     def experiment_of(*overrides: str) -> Experiment:
-        return build_experiment(composed(["memory=vq_joint", *overrides]))
+        return build_experiment(compose_config(["memory=vq_joint", *overrides]))
 
     def identity(*overrides: str) -> str:
         return experiment_of(*overrides).identity("data").id
@@ -183,7 +183,7 @@ def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
 
 def test_a_refiner_has_a_rate_of_its_own_and_its_network_keeps_its():
     words = [*TINY, "refiner=sage", "optim.lr=4e-3", "optim.final_lr=4e-4"]
-    plain, own = (build_experiment(composed([*words, *more])) for more in ([], ["refiner.lr=1e-3"]))
+    plain, own = (build_experiment(compose_config([*words, *more])) for more in ([], ["refiner.lr=1e-3"]))
     assert plain.training.optim.lr == 4e-3
     assert (own.training.optim.lr, own.training.optim.final_lr) == (1e-3, pytest.approx(1e-4))
     assert own.unrefined.training.optim.lr == 4e-3

@@ -13,8 +13,8 @@ from memmlp.common.components import collect_components, find_component
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
 from memmlp.config.build_request import build_motion
-from memmlp.config.compose import composed
-from memmlp.config.schema import restored
+from memmlp.config.compose import compose_config
+from memmlp.config.schema import restore_config
 from memmlp.motion.preparing.find_clips import Folders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
@@ -36,7 +36,7 @@ def home(tmp_path: Path, monkeypatch) -> Path:
 
 def mix(changes: dict | None = None, *words: str):
     Path("conf/data/my_mix.yaml").write_text(yaml.safe_dump(MIX | (changes or {})))
-    return composed(["--config-dir", "conf", "data=my_mix", *words])
+    return compose_config(["--config-dir", "conf", "data=my_mix", *words])
 
 
 def with_source(**keys) -> dict:
@@ -44,18 +44,18 @@ def with_source(**keys) -> dict:
 
 
 def test_a_list_of_one_folder_is_that_folder():
-    one, listed = (build_motion(composed(["data=mocap", f"data.root={root}"])) for root in ("a", "[a]"))
+    one, listed = (build_motion(compose_config(["data=mocap", f"data.root={root}"])) for root in ("a", "[a]"))
     assert one == listed
     assert isinstance(one.clips.split, SeededSplit)
 
 
 def test_a_list_of_folders_names_sources_after_them():
-    source = build_motion(composed(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).clips
+    source = build_motion(compose_config(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).clips
     assert source.root == Folders({"b": Path("b"), "a": Path("a")})
     assert isinstance(source.split, MixedSplit)
     assert {split.test for split in source.split.splits.values()} == {0.2}
     with pytest.raises(InputError, match=r"data\.root"):
-        build_motion(composed(["data=mocap", "data.root=[a,x/a]"]))
+        build_motion(compose_config(["data=mocap", "data.root=[a,x/a]"]))
 
 
 def test_named_sources_have_fractions_of_their_own():
@@ -70,7 +70,7 @@ def test_named_sources_have_fractions_of_their_own():
 def test_a_fraction_that_each_source_has_itself_is_refused():
     shares = {"cmu": 0.3, "bandai": 0.0}  # none is a share of its own, too
     both = {"sources": {name: {**one, "test": shares[name]} for name, one in MIX["sources"].items()}}
-    with pytest.raises(InputError, match=r"^data\.split\.test=0\.5: each source has its own"):
+    with pytest.raises(InputError, match=r"^data\.split\.test=0\.5: each source sets its own value"):
         mix(both, "data.split.test=0.5")
     assert mix(both, "data.split.val=0.2").data.split.val == 0.2
     assert mix(with_source(test=0.3), "data.split.test=0.5").data.split.test == 0.5  # which is bandai's
@@ -114,13 +114,13 @@ def test_what_does_not_go_together_is_one_line(changes, words, said):
     assert said in str(error.value)
     assert "\n" not in str(error.value)
     with pytest.raises(InputError, match=r"data.root=None: must be a folder or a list"):
-        composed(["data=mocap", "data.root=null"])
+        compose_config(["data=mocap", "data.root=null"])
 
 
 def test_sources_on_the_command_line_are_told_where_they_go():
     for word in ("+data.sources.x={root: a}", "data.sources={x: {root: a}}", "+data.sources.x.root=a"):
         with pytest.raises(InputError, match=r"^data\.sources: .*config file"):
-            composed(["data=mocap", "data.root=null", word])
+            compose_config(["data=mocap", "data.root=null", word])
 
 
 def test_weights_are_drawn_by_and_enter_the_identity_where_there_are_any():
@@ -132,7 +132,7 @@ def test_weights_are_drawn_by_and_enter_the_identity_where_there_are_any():
     plain = {name: {"root": source["root"]} for name, source in MIX["sources"].items()}
     bare = mix({"sources": plain})
     assert build_experiment(bare).training.shares is None
-    one = composed(["data=mocap", "data.root=a"])
+    one = compose_config(["data=mocap", "data.root=a"])
     assert identity(bare) == identity(one)  # on the same data, whose digest knows the clips
     assert len({identity(cfg) for cfg in (weighted, bare, mix(None, "data.sources.cmu.weight=3"))}) == 3
 
@@ -148,11 +148,11 @@ def test_own_groups_and_column_files_enter_the_evaluation_alone():
 def test_a_run_on_a_mix_is_restored():
     cfg = mix()
     record = OmegaConf.to_container(cfg, resolve=True)
-    assert build_motion(restored(record)) == build_motion(cfg)
+    assert build_motion(restore_config(record)) == build_motion(cfg)
 
 
 def test_another_version_of_a_generator_makes_other_motion(monkeypatch: pytest.MonkeyPatch):
-    before = build_motion(composed(["profile=tiny"])).clips.root
+    before = build_motion(compose_config(["profile=tiny"])).clips.root
     newer = replace(find_component("generator", "puppet"), version=7)
     monkeypatch.setitem(collect_components(), ("generator", "puppet"), newer)
-    assert build_motion(composed(["profile=tiny"])).clips.root == before.with_name(f"{before.name}-v7")
+    assert build_motion(compose_config(["profile=tiny"])).clips.root == before.with_name(f"{before.name}-v7")

@@ -11,10 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.components import SLOTS, list_component_names
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import _hydra, composed, parse, preflight
-from memmlp.config.plugins import packaged
+from memmlp.config.compose import _initialize_hydra, compose_config, compose_jobs, parse_hydra_arguments
+from memmlp.config.plugins import find_packaged_folder
 
-OF_TERMS = [path.stem for path in packaged("conf").glob("loss/*.yaml")]
+OF_TERMS = [path.stem for path in find_packaged_folder("conf").glob("loss/*.yaml")]
 
 
 @pytest.mark.slow
@@ -35,10 +35,10 @@ def test_every_option_composes_and_passes(tmp_path: Path):
     }
     options = [f"{slot}={name}" for slot in SLOTS for name in list_component_names(slot)]
     for group in ("data", "experiment", "loggers", "loss", "profile"):
-        options += [f"{group}={path.stem}" for path in (packaged("conf") / group).glob("*.yaml")]
+        options += [f"{group}={path.stem}" for path in (find_packaged_folder("conf") / group).glob("*.yaml")]
     assert len(options) > 60
     for option in options:
-        assert isinstance(composed([option, *needed.get(option, [])]), DictConfig), option
+        assert isinstance(compose_config([option, *needed.get(option, [])]), DictConfig), option
 
 
 def test_a_component_has_the_sizes_of_the_profile():
@@ -47,17 +47,17 @@ def test_a_component_has_the_sizes_of_the_profile():
         ("small", (41, 128), (48, [2, 4, 6, 8]), (2000, 32)),
         ("paper", (41, 512), (192, [2, 4, 6, 8]), (300_000, 256)),
     ):
-        cfg = composed([f"profile={profile}"])
+        cfg = compose_config([f"profile={profile}"])
         assert (cfg.model.frames, cfg.model.width) == model
         assert (cfg.memory.width, list(cfg.memory.layers)) == memory
         assert (cfg.optim.steps, cfg.optim.batch) == optim
-    cfg = composed(["profile=tiny", "profile.sizes=small", "profile.width=64", "model.depth=4"])
+    cfg = compose_config(["profile=tiny", "profile.sizes=small", "profile.width=64", "model.depth=4"])
     assert (cfg.model.width, cfg.memory.width, list(cfg.memory.layers)) == (64, 24, [2, 4])
     assert cfg.optim.steps == 20
 
 
 def test_the_most_literal_reading():
-    cfg = composed(["experiment=paper"])
+    cfg = compose_config(["experiment=paper"])
     assert (cfg.model.width, cfg.model.depth, cfg.model.frames) == (512, 8, 41)
     assert (cfg.normalizer.coordinates, cfg.normalizer.z_scores) == ("world", False)
     assert (cfg.memory.shift, cfg.memory.history, cfg.memory.fusion) == ("frame", "latest", "plain")
@@ -65,33 +65,33 @@ def test_the_most_literal_reading():
     assert (cfg.optim.steps, cfg.optim.batch, cfg.optim.drop_at) == (300_000, 256, 0.75)
     assert (cfg.vqvae.epochs, cfg.vqvae.steps, cfg.vqvae.codebook) == (100, None, "ema")
     assert (cfg.data.drawn_by, cfg.evaluation.ik) == ("clips", "lbfgs")
-    assert (composed([]).data.drawn_by, composed([]).evaluation.ik) == ("frames", "off")
+    assert (compose_config([]).data.drawn_by, compose_config([]).evaluation.ik) == ("frames", "off")
 
 
 def test_a_vqvaes_epochs_are_of_the_training_frames():
     """100 epochs of 1000 frames in batches of 256 are 390.6 steps; steps are steps, whatever the frames."""
-    optim = build_experiment(composed(["profile=paper"])).prerequisites[0].optim
+    optim = build_experiment(compose_config(["profile=paper"])).prerequisites[0].optim
     assert [optim(frames).steps for frames in (1000, 5_000_000)] == [391, 1_953_125]
     assert optim(1000).validate_every == 391
-    half = build_experiment(composed(["vqvae.epochs=0.5", "vqvae.steps=null"])).prerequisites[0].optim
+    half = build_experiment(compose_config(["vqvae.epochs=0.5", "vqvae.steps=null"])).prerequisites[0].optim
     assert half(5120).steps == 10
-    steps = build_experiment(composed([])).prerequisites[0].optim
+    steps = build_experiment(compose_config([])).prerequisites[0].optim
     assert [steps(frames).steps for frames in (1000, 5_000_000)] == [2000, 2000]
 
 
 def test_the_last_of_several_choices_wins():
-    assert composed(["memory=vq", "seed=1", "memory=none", "seed=2"]).seed == 2
-    assert composed(["memory=vq", "memory=none"]).memory.name == "none"
+    assert compose_config(["memory=vq", "seed=1", "memory=none", "seed=2"]).seed == 2
+    assert compose_config(["memory=vq", "memory=none"]).memory.name == "none"
 
 
 def test_a_text_is_kept_as_it_was_written():
     for word in ("'2024_11'", "2024", "2024_a", "007", "'[x]_1'", "True"):
-        assert composed([f"save_predictions={word}"]).save_predictions == word.strip("'")
+        assert compose_config([f"save_predictions={word}"]).save_predictions == word.strip("'")
 
 
 def test_outputs_come_from_the_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MEMMLP_OUTPUTS", "/somewhere")
-    assert composed([]).data.root == "/somewhere/data/synth"
+    assert compose_config([]).data.root == "/somewhere/data/synth"
 
 
 BAD = {
@@ -154,8 +154,8 @@ BAD = {
     "texts that would be others": [
         (["save_predictions="], ["save_predictions=:", "a folder, or null"]),
         (["save_predictions=2024_11"], ["save_predictions=2024_11", "202411", "='2024_11'\""]),
-        (["paths.outputs=1e3"], ["paths.outputs=1e3", "1000.0", "in quotes"]),
-        (["-m", "save_predictions=a,1_0"], ["save_predictions=a,1_0", "10", "in quotes"]),
+        (["paths.outputs=1e3"], ["paths.outputs=1e3", "1000.0", "quote the value"]),
+        (["-m", "save_predictions=a,1_0"], ["save_predictions=a,1_0", "10", "quote the value"]),
         (["data=mocap", "data.root=.", "data.split.groups=[a,10_01]"], ["data.split.groups", "1001"]),
     ],
     "missing values": [
@@ -225,8 +225,8 @@ def test_an_option_of_ones_own_that_ours_hides_is_refused(
         "hydra.searchpath": ["train", "hydra.searchpath=[file://mine]", "optim.lr=-1"],
         "sweep": ["sweep", "s.yaml", "--config-dir", "mine", "optim.lr=-1"],
     }[place]
-    assert one_line(memmlp(*words), f"mine/{option}", f"conf/{option} is used in its place")
-    own.write_bytes((packaged("conf") / option).read_bytes())  # the same is no other
+    assert one_line(memmlp(*words), f"mine/{option}", f"conf/{option} instead")
+    own.write_bytes((find_packaged_folder("conf") / option).read_bytes())  # the same is no other
     ran = memmlp(*words)
     assert ran.code == 0 if place == "--cfg" else one_line(ran, "optim.lr=-1")
 
@@ -234,14 +234,14 @@ def test_an_option_of_ones_own_that_ours_hides_is_refused(
 def test_a_file_with_the_name_of_a_component_is_refused(memmlp: Memmlp, tmp_path: Path):
     (tmp_path / "mine" / "memory").mkdir(parents=True)
     (tmp_path / "mine" / "memory" / "gru.yaml").write_text("name: gru\n")
-    assert one_line(memmlp("train", "--config-dir", "mine"), "mine/memory/gru.yaml", "another name")
+    assert one_line(memmlp("train", "--config-dir", "mine"), "mine/memory/gru.yaml", "rename the file")
 
 
 def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
     for words in (["optim.lr=-1"], ["--cfg", "job"], ["--help"]):
         ran = memmlp("train", "experiment=no_codes", "experiment=manual_weights", *words)
         assert one_line(ran, "experiment=manual_weights", "would replace experiment=no_codes", "=[A,B]")
-    both = composed(["experiment=[no_codes,manual_weights]"])
+    both = compose_config(["experiment=[no_codes,manual_weights]"])
     assert (both.memory.name, both.loss.name) == ("no_codes", "manual")
 
 
@@ -267,10 +267,10 @@ def test_an_experiment_that_leads_back_to_itself_is_refused(memmlp: Memmlp, tmp_
 )
 def test_a_job_is_composed_as_hydra_composes_it(overrides):
     """Options of groups are chosen once for many jobs (twice here), and changes of one job are its own."""
-    args = parse(overrides)
+    args = parse_hydra_arguments(overrides)
     for _ in range(2):
-        (own,) = preflight(args)
-        with _hydra(args):
+        (own,) = compose_jobs(args)
+        with _initialize_hydra(args):
             assert own == compose("train", list(overrides))
         assert OmegaConf.is_struct(own)
         own.model.frames, own.seed = 99, 99

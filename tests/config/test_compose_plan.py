@@ -10,8 +10,8 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
 from memmlp.config.build_request import build_request, build_requests
-from memmlp.config.compose import composed
-from memmlp.config.compose_plan import find_sweep, sweep_folder
+from memmlp.config.compose import compose_config
+from memmlp.config.compose_plan import find_sweep, get_sweep_folder
 
 NESTED = {
     "inner": "defaults: [{override /memory: gru}]\nmodel: {width: 24}\n",
@@ -74,16 +74,16 @@ def test_a_sweep_has_one_folder_in_whatever_order_it_is_asked_for(tmp_path: Path
     """Rounds of seeds that were looked at once would else be looked at again, and counted as the first."""
     sweep = find_sweep("14", [])
     a, b, c = (
-        sweep_folder(replace(sweep, command_line=words), tmp_path)
+        get_sweep_folder(replace(sweep, command_line=words), tmp_path)
         for words in (("threads=1", "seed=3"), ("seed=3", "threads=1"), ("seed=3", "seed=4", "threads=1"))
     )
     assert a == b != c
-    assert sweep_folder(replace(sweep, command_line=("seed=4", "seed=3", "threads=1")), tmp_path) != c
-    assert sweep_folder(sweep, tmp_path) == tmp_path / "sweeps" / sweep.name
+    assert get_sweep_folder(replace(sweep, command_line=("seed=4", "seed=3", "threads=1")), tmp_path) != c
+    assert get_sweep_folder(sweep, tmp_path) == tmp_path / "sweeps" / sweep.name
 
 
 def test_requests_of_several_seeds_are_those_of_each_seed():
-    cfg = composed(["vqvae.seed=${seed}", "memory=vq", "data.synth.minutes=0.5"])
+    cfg = compose_config(["vqvae.seed=${seed}", "memory=vq", "data.synth.minutes=0.5"])
     requests = list(build_requests(cfg, [4, 0, 7]))
     assert [request.config["vqvae"]["seed"] for request in requests] == [4, 0, 7]
     for seed, request in zip([4, 0, 7], requests, strict=True):

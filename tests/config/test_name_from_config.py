@@ -7,19 +7,19 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from memmlp.config.compose import composed
-from memmlp.config.name_from_config import readable_name
+from memmlp.config.compose import compose_config
+from memmlp.config.name_from_config import make_readable_name
 
 pytestmark = pytest.mark.slow
 
 
 def config(*words: str) -> dict[str, Any]:
-    found: Any = OmegaConf.to_container(composed(list(words)), resolve=True)
+    found: Any = OmegaConf.to_container(compose_config(list(words)), resolve=True)
     return found
 
 
 def name(*words: str) -> str:
-    return readable_name("memmlp", config(*words))
+    return make_readable_name("memmlp", config(*words))
 
 
 @pytest.mark.parametrize(("words", "expected"), [
@@ -46,6 +46,6 @@ def test_many_differences_are_counted():
 def test_a_vqvae_and_a_component_of_ones_own():
     whole = config()
     codes = {"normalizer": whole["normalizer"], "vqvae": whole["vqvae"] | {"codes": 9, "seed": 4}}
-    assert readable_name("vqvae", codes) == "VQ-VAE · vqvae.codes=9 · seed 4"
+    assert make_readable_name("vqvae", codes) == "VQ-VAE · vqvae.codes=9 · seed 4"
     mine = whole | {"memory": {"name": "mine", "knob": 3}}
-    assert readable_name("memmlp", mine) == "memory=mine · seed 0"
+    assert make_readable_name("memmlp", mine) == "memory=mine · seed 0"

@@ -10,8 +10,8 @@ import yaml
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import composed
-from memmlp.config.open_run import experiment_of
+from memmlp.config.compose import compose_config
+from memmlp.config.open_run import build_run_experiment
 from memmlp.runs.run import Run
 
 
@@ -20,7 +20,9 @@ def trained(tmp_path: Path) -> Run:
     """A run that has a record alone."""
     run = Run.from_id(tmp_path, "0123456789abcdef")
     run.folder.mkdir(parents=True)
-    config = build_experiment(composed(["profile=tiny", "memory=none", f"paths.outputs={tmp_path}"])).config
+    config = build_experiment(
+        compose_config(["profile=tiny", "memory=none", f"paths.outputs={tmp_path}"])
+    ).config
     run.config_path.write_text(yaml.safe_dump(config))
     write_json(run.manifest_path, {"id": run.id, "kind": "memmlp"})
     write_json(run.marker, {"id": run.id, "artifacts": {}})
@@ -29,7 +31,7 @@ def trained(tmp_path: Path) -> Run:
 
 def test_keys_of_later_stages_may_have_other_values(trained: Run):
     words = ["evaluation.ik=arms", "export.precision=int8", "data.strict=true"]
-    config = experiment_of(trained, "cpu", words).config
+    config = build_run_experiment(trained, "cpu", words).config
     values = config["evaluation"]["ik"], config["export"]["precision"], config["data"]["strict"]
     assert values == ("arms", "int8", True)
 
@@ -37,9 +39,9 @@ def test_keys_of_later_stages_may_have_other_values(trained: Run):
 def test_a_key_without_effect_is_refused(trained: Run):
     for word in ("force=true", "device=cuda", "save_predictions=a", "profile.steps=3", "optim.log_every=7"):
         with pytest.raises(InputError, match=word):
-            experiment_of(trained, "cpu", ["evaluation.ik=arms", word])
+            build_run_experiment(trained, "cpu", ["evaluation.ik=arms", word])
 
 
 def test_several_values_of_a_key_are_refused(trained: Run):
     with pytest.raises(InputError, match=r"^evaluation\.ik=off,arms"):
-        experiment_of(trained, "cpu", ["evaluation.ik=off,arms"])
+        build_run_experiment(trained, "cpu", ["evaluation.ik=off,arms"])

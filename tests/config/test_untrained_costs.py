@@ -8,8 +8,8 @@ import pytest
 from conftest import Memmlp, one_line
 from fake_runs import fake_run
 
-from memmlp.config.build import untrained
-from memmlp.config.untrained_costs import with_costs
+from memmlp.config.build import build_untrained
+from memmlp.config.untrained_costs import measure_untrained_variants
 from memmlp.report.kept_results import KeptResults
 from memmlp.report.result_pages import describe_origin
 from memmlp.report.tables.build_table import make_table
@@ -24,12 +24,12 @@ SWEEP = parse_sweep("sizes", {"variants": ARMS, "metrics": METRICS, "base": ["pr
 @pytest.mark.slow
 def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: Path):
     run = load_measured_run(fake_run(tmp_path, "mine", 3).folder)
-    runs, flags = with_costs(SWEEP, {"Mem-MLP": {3: run}, "AvatarPoser": {}})
+    runs, flags = measure_untrained_variants(SWEEP, {"Mem-MLP": {3: run}, "AvatarPoser": {}})
     assert runs["Mem-MLP"] == {3: run}
     assert flags == ("networks that were not trained, with random weights: 'AvatarPoser'",)
     (seed, found), *others = runs["AvatarPoser"].items()
     assert (seed, others, found.means) == (3, [], {})
-    model = untrained(["profile=tiny", "model=avatar_poser"])
+    model = build_untrained(["profile=tiny", "model=avatar_poser"])
     numbers = sum(parameter.numel() for parameter in model.parameters())
     assert found.costs["parameters"] == pytest.approx(numbers / 1e6)
     assert found.costs["FLOPs"] == pytest.approx(2 * found.costs["MACs"])

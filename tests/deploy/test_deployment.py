@@ -15,7 +15,7 @@ from conftest import one_line
 
 import memmlp as package
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import composed
+from memmlp.config.compose import compose_config
 from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import stream_onnx
@@ -125,7 +125,7 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
 def test_a_deployment_in_fp16_and_an_older_opset(small_yardstick, tmp_path):
     place, model = DeploymentFolder(tmp_path), exported.NETWORKS["no_memory"]()
     words = ["export.precision=fp16", "export.opset=15", "export.alone=true"]
-    deployment = build_experiment(composed(words)).deployment
+    deployment = build_experiment(compose_config(words)).deployment
     assert (deployment.precision, deployment.opset, deployment.alone) == ("fp16", 15, True)
     record = deployment.deploy(model, place, "0" * 16, CLIPS, CLIPS)
     cost = record["fp16"]

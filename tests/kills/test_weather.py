@@ -22,9 +22,9 @@ from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.runs.evaluation_file import is_intact, write_report
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.search.director import objectives
+from memmlp.sweep.search.director import read_objectives
 from memmlp.sweep.search.search_file import Objective
-from memmlp.sweep.worker import attempt
+from memmlp.sweep.worker import try_task
 
 TASK = RunTask("a" * 16, "memmlp", {}, None, ("stream-0", "fp32-0"))
 STEPS = 2
@@ -95,7 +95,7 @@ class Written:
 
 def finish(plan: Plan, task: RunTask) -> None:
     """Finish a run of a few steps as the pipeline does: from its checkpoint, and only missing stages."""
-    run = plan.run_of(task)
+    run = plan.get_run(task)
     if not run.done:
         run.begin(task.kind, {"optim": {"steps": STEPS}}, data="d", prerequisite=None)
         run.clear_stages()
@@ -150,21 +150,21 @@ def plan(tmp_path: Path) -> Plan:
 @pytest.mark.slow
 def test_a_disk_that_is_full_at_any_write(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(lease, "LEASE", 0.0)  # leases of processes that ended expire at once
-    run = plan.run_of(TASK)
+    run = plan.get_run(TASK)
     full, refused = 0, True
     while refused:
         with monkeypatch.context() as context:
             disk = Disk(context, tmp_path, errno.ENOSPC, full)
-            error = error_of(lambda: attempt(plan, TASK, finish))
+            error = error_of(lambda: try_task(plan, TASK, finish))
         refused = error is not None
         if refused:
             assert isinstance(error, OSError)
             assert (error.errno, bool(error.filename)) == (errno.ENOSPC, True), full
-            assert not plan.complete(TASK)
+            assert not plan.is_complete(TASK)
         assert sound(run), full
         assert run.failure is None
-        until(lambda: attempt(plan, TASK, finish), "the run can be taken")
-        assert plan.complete(TASK), full
+        until(lambda: try_task(plan, TASK, finish), "the run can be taken")
+        assert plan.is_complete(TASK), full
         assert sound(run)
         assert run.step == STEPS
         run.reset()
@@ -232,6 +232,6 @@ def test_results_plans_and_logs_cut_at_every_byte_are_refused(plan: Plan, tmp_pa
     wanted = [Objective("MPJPE", ((1.0, "rotation MPJPE"),))]
     for step in (10, 20):
         run.log(step, {"rotation MPJPE": 100.0 / step}, "val")
-    assert objectives(wanted, run) == [5.0]
+    assert read_objectives(wanted, run) == [5.0]
     size = run.metrics_path.stat().st_size
-    assert at_every_byte(run.metrics_path, lambda: objectives(wanted, run)) == size
+    assert at_every_byte(run.metrics_path, lambda: read_objectives(wanted, run)) == size

@@ -6,7 +6,7 @@ import pytest
 import tiny
 import torch
 
-from memmlp.config.build import untrained
+from memmlp.config.build import build_untrained
 from memmlp.deploy.export import export
 from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
@@ -88,7 +88,7 @@ def test_cells_stay_exact_where_layers_are_rounded(cell):
 )
 def test_parameters(profile, members, width, depth):
     """A block's GRU is 6 d d + 6 d, its MLP of d hidden units 2 d d + 2 d, its two norms 4 d."""
-    model = untrained(["model=recurrent_poser", f"profile={profile}"])
+    model = build_untrained(["model=recurrent_poser", f"profile={profile}"])
     ends = 54 * width + width + 2 * width + 132 * width + 132
     assert model.count_parameters() == members * (depth * (8 * width**2 + 12 * width) + ends)
     assert model.count_parameters() < 4_200_000

@@ -6,7 +6,7 @@ import pytest
 import tiny
 import torch
 
-from memmlp.config.build import untrained
+from memmlp.config.build import build_untrained
 from memmlp.evaluation import modes
 from memmlp.evaluation.ik import Arms
 from memmlp.evaluation.modes import extract_positions
@@ -28,7 +28,7 @@ def network(name: str) -> RefinedModel:
 def test_it_has_the_published_size(name):
     """VAE-HMD leaves out of its count what only training uses, behind a refiner as well."""
     bare, refined = (
-        untrained(["profile=paper", f"model={name}", *words]) for words in ([], ["refiner=sage"])
+        build_untrained(["profile=paper", f"model={name}", *words]) for words in ([], ["refiner=sage"])
     )
     assert refined.count_parameters() - bare.count_parameters() == 2_635_908
 

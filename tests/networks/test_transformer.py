@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import nn
 
-from memmlp.config.build import untrained
+from memmlp.config.build import build_untrained
 from memmlp.networks.transformer import Attention, DiTBlock
 
 EMBEDDING = (".query", ".key", ".value")
 
 
 def linear_layers(name: str) -> dict[str, nn.Linear]:
-    model = untrained(["profile=small", f"model={name}"]).requires_grad_(False)
+    model = build_untrained(["profile=small", f"model={name}"]).requires_grad_(False)
     return {at: layer for at, layer in model.named_modules() if isinstance(layer, nn.Linear)}
 
 

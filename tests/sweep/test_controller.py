@@ -9,7 +9,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.sweep import controller
-from memmlp.sweep.controller import PATIENCE, Fleet
+from memmlp.sweep.controller import MAX_FAILED_STARTS, Fleet
 from memmlp.sweep.plan import Plan, RunTask
 from memmlp.sweep.progress_table import Board
 
@@ -59,12 +59,12 @@ class Shelf:
 def test_a_fleet_replaces_the_dead_and_is_no_larger_than_the_work(tmp_path: Path):
     shelf = Shelf(Living)
     fleet = Fleet(shelf, lambda: None, 3, tmp_path)
-    fleet.keep(2)
+    fleet.maintain(2)
     assert len(shelf.handles) == 2
-    fleet.keep(9)
+    fleet.maintain(9)
     assert len(shelf.handles) == 3
     shelf.handles[0].cancelled = True
-    fleet.keep(9)
+    fleet.maintain(9)
     assert len(shelf.handles) == 4
     assert shelf.batches == [2, 1, 1]  # those that start at once are started together
     fleet.cancel()
@@ -83,8 +83,8 @@ def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytes
         def update(self, plan: Plan, states: Mapping[str, str]) -> None:
             told.append(states[task.key])
             if len(told) == 2:
-                plan.run_of(task).folder.mkdir(parents=True)
-                plan.run_of(task).fail("the loss is nan")
+                plan.get_run(task).folder.mkdir(parents=True)
+                plan.get_run(task).fail("the loss is nan")
 
     controller.oversee(plan, Fleet(Shelf(Living), lambda: None, 1, tmp_path), Looks())
     assert told == ["new", "new", "failed"]
@@ -93,7 +93,7 @@ def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize(("kind", "line"), [(Dead, "the reason"), (Unfit, Unfit.said)])
 def test_workers_that_never_live_end_the_sweep(tmp_path: Path, kind: type[Dead], line: str):
     fleet = Fleet(Shelf(kind), lambda: None, 2, tmp_path)
-    for _ in range(PATIENCE):
-        fleet.keep(5)
+    for _ in range(MAX_FAILED_STARTS):
+        fleet.maintain(5)
     with pytest.raises(InputError, match=f"end as soon as they are started: {line}; see"):
-        fleet.keep(5)
+        fleet.maintain(5)

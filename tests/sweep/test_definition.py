@@ -17,7 +17,7 @@ VARIANTS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE"
 
 def test_jobs_are_variants_by_seeds_with_base_and_difference():
     sweep = parse_sweep("s", {"base": ["profile=tiny"], "seeds": [0, 2], "variants": VARIANTS})
-    assert [(one.label, one.seed, one.overrides) for one in sweep.variant_seeds()] == [
+    assert [(one.label, one.seed, one.overrides) for one in sweep.list_variant_seeds()] == [
         ("full", 0, ("profile=tiny", "seed=0")),
         ("full", 2, ("profile=tiny", "seed=2")),
         ("none", 0, ("profile=tiny", "memory=none", "seed=0")),
@@ -28,15 +28,15 @@ def test_jobs_are_variants_by_seeds_with_base_and_difference():
 def test_the_command_line_stands_over_the_base_and_beside_the_variant():
     content = {"base": ["model.depth=8"], "variants": {"wide": ["model.width=10"], "base": []}}
     sweep = parse_sweep("s", content).with_overrides(["model.depth=4", "optim.lr=1"])
-    assert set(sweep.all_overrides(sweep.variants[0])) == {"model.width=10", "model.depth=4", "optim.lr=1"}
-    assert set(sweep.all_overrides(sweep.variants[1])) == {"model.depth=4", "optim.lr=1"}
+    assert set(sweep.merge_overrides(sweep.variants[0])) == {"model.width=10", "model.depth=4", "optim.lr=1"}
+    assert set(sweep.merge_overrides(sweep.variants[1])) == {"model.depth=4", "optim.lr=1"}
 
 
 def test_a_key_that_a_variant_sets_is_refused_on_the_command_line():
     """The variant's own value would win, and the override would be lost silently."""
     content = {"variants": {"two": ["memory.layers=[2]"], "no hand": ["hand=off"], "all": []}}
     for override in ("memory.layers=[2]", "+memory.layers=[9]", "~hand"):
-        with pytest.raises(InputError, match=r"variant '(two|no hand)' of sweep s sets .* itself"):
+        with pytest.raises(InputError, match=r"variant '(two|no hand)' of sweep s already sets"):
             parse_sweep("s", content).with_overrides(["profile=tiny", override])
     content["variants"]["two"] = content["variants"]["no hand"] = {"overrides": None}  # the paper's rows
     assert parse_sweep("s", content).with_overrides(["~hand"]).command_line == ("~hand",)
@@ -72,7 +72,7 @@ def test_axes_are_a_grid_over_every_variant():
     assert sweep.variants[1].overrides == ("loss=manual", "model.frames=11", "memory.layers=[2,4]")
     printed = parse_sweep("s", {"variants": {"theirs": {"overrides": None}, "a": []}, "axes": axes})
     assert [variant.label for variant in printed.variants if variant.overrides is None] == ["theirs"]
-    assert len(printed.runnable()) == 4
+    assert len(printed.list_runnable()) == 4
     seeds = parse_sweep("s", {"axes": {"seed": [5, 6]}})
     assert [(variant.label, variant.overrides) for variant in seeds.variants] == [("base", ())]
     assert seeds.seeds == (5, 6)
@@ -91,7 +91,7 @@ def test_a_list_of_grids_gives_each_of_their_cells_once():
     ]
     assert len(sweep.variants) == 6
     assert sweep.variants[4].label == "none, a=2, b=3"
-    assert sweep.control_of(sweep.variants[4]) == "full, a=2, b=3"
+    assert sweep.find_control(sweep.variants[4]) == "full, a=2, b=3"
     assert (sweep.variants[4].series, sweep.variants[4].own_overrides) == ("none", ("memory=none",))
     assert (
         parse_sweep("s", {"variants": variants, "axes": axes[0]}).variants
@@ -123,5 +123,5 @@ def test_what_is_read_is_what_was_kept(tmp_path: Path):
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"variants": [{"no": 1}]}'])
 def test_a_damaged_copy_is_named(tmp_path: Path, text: str):
     (tmp_path / NAME).write_text(text)
-    with pytest.raises(InputError, match=f"{NAME}: not a sweep"):
+    with pytest.raises(InputError, match=f"{NAME}: must be a sweep"):
         load_sweep_copy(tmp_path)

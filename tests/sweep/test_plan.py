@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.sweep.plan import Entry, Forecast, Plan, RunTask, forecast, unique
+from memmlp.sweep.plan import Entry, Forecast, Plan, RunTask, estimate_time, order_tasks
 
 
 def a_plan() -> Plan:
@@ -19,14 +19,14 @@ def a_plan() -> Plan:
         RunTask("plain", "memmlp", {}, None, ("stream",)),
     )
     entries = [Entry(label, 0, run, ("stream",)) for label, run in VARIANTS.items()]
-    return Plan("s", Path("outputs"), tuple(entries), unique(tasks))
+    return Plan("s", Path("outputs"), tuple(entries), order_tasks(tasks))
 
 
 VARIANTS = {"network": "net", "refined": "refined", "plain": "plain"}
 
 
 def needed(*labels: str) -> list[str]:
-    part = a_plan().of_variants(labels)
+    part = a_plan().select_variants(labels)
     assert {entry.label for entry in part.entries} == set(labels)
     return [task.key for task in part.tasks]
 
@@ -36,7 +36,7 @@ def test_variants_need_their_runs_and_their_prerequisites():
     assert needed("network") == ["vqvae", "net stream"]
     assert needed("refined") == ["vqvae", "net", "refined stream"]
     assert needed() == []
-    assert a_plan().of_variants(VARIANTS) == a_plan()
+    assert a_plan().select_variants(VARIANTS) == a_plan()
 
 
 CODES, QUICK, SLOW = ("c" * 16,), ("a" * 16, "b" * 16), ("d" * 16, "e" * 16)
@@ -57,7 +57,7 @@ def plan(tmp_path: Path) -> Plan:
 def finish(plan: Plan, name: str, seconds: object) -> None:
     """End a run that took so long."""
     task = next(task for task in plan.tasks if task.id == name)
-    run = plan.run_of(task)
+    run = plan.get_run(task)
     run.begin(task.kind, {}, data="d", prerequisite=task.prerequisite)
     run.write_manifest({"seconds": seconds})
     run.results_path.write_text("{}")
@@ -65,19 +65,19 @@ def finish(plan: Plan, name: str, seconds: object) -> None:
 
 
 def test_nothing_is_foretold_of_a_kind_of_which_nothing_has_finished(plan: Plan):
-    assert forecast(plan) is None
+    assert estimate_time(plan) is None
     finish(plan, CODES[0], 10.0)
-    assert forecast(plan) is None
+    assert estimate_time(plan) is None
 
 
 def test_a_run_is_judged_by_its_variant(plan: Plan):
     finish(plan, CODES[0], 10.0)
     finish(plan, QUICK[0], {"train": 50.0, "evaluate": 10.0})
     finish(plan, SLOW[0], {"train": 1000.0, "evaluate": 200.0})
-    assert forecast(plan) == Forecast(60.0 + 1200.0, finished=2)
+    assert estimate_time(plan) == Forecast(60.0 + 1200.0, finished=2)
 
 
 def test_an_variant_without_a_finished_run_is_judged_by_the_others_and_counted(plan: Plan):
     finish(plan, CODES[0], 10.0)
     finish(plan, QUICK[0], 60.0)
-    assert forecast(plan) == Forecast(60.0 + 2 * 60.0, finished=1)
+    assert estimate_time(plan) == Forecast(60.0 + 2 * 60.0, finished=1)

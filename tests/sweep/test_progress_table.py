@@ -12,7 +12,7 @@ from rich.console import Console
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.sweep import progress_table
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.progress_table import QUIET, Board, progress_text, time_left
+from memmlp.sweep.progress_table import QUIET, Board, describe_progress, estimate_time_left
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def plan(tmp_path: Path) -> Plan:
     tasks = tuple(RunTask(str(number) * 16, "memmlp", {"optim": {"steps": 9}}) for number in range(4))
     made = Plan("trial", tmp_path, tuple(Entry("variant", n, t.id) for n, t in enumerate(tasks)), tasks)
     for task in tasks:
-        made.run_of(task).folder.mkdir(parents=True)
+        made.get_run(task).folder.mkdir(parents=True)
     return made
 
 
@@ -43,18 +43,18 @@ def test_a_log_is_not_silent_while_runs_go_on(plan: Plan, monkeypatch: pytest.Mo
     assert told("running", "new", "new", "done") == ["1 of 4 done; variant seed 0: running"]
     clock.now += QUIET - 1
     assert told("running", "new", "new", "done") == []
-    plan.run_of(plan.tasks[0]).log(3, {"loss": 0.5})
+    plan.get_run(plan.tasks[0]).log(3, {"loss": 0.5})
     clock.now += 1
     assert told("running", "new", "new", "done") == ["1 of 4 done; variant seed 0: 3/9 loss 0.5"]
     assert told("running", "new", "new", "done") == []
 
 
 def test_a_run_whose_training_is_over_shows_its_stage(plan: Plan):
-    run = plan.run_of(plan.tasks[0])
+    run = plan.get_run(plan.tasks[0])
     with run.lock():
-        assert progress_text(run, 9) == "starting"
+        assert describe_progress(run, 9) == "starting"
         run.attempt("deployment")
-        assert progress_text(run, 9) == "exporting"
+        assert describe_progress(run, 9) == "exporting"
 
 
 def test_the_time_left_follows_from_the_last_five_entries(monkeypatch: pytest.MonkeyPatch):
@@ -63,6 +63,6 @@ def test_the_time_left_follows_from_the_last_five_entries(monkeypatch: pytest.Mo
     quick = [(900 + 100 * n, 9000 + 10.0 * n) for n in range(1, 5)]
     log = [LogRecord(step, "train", {"loss": 1.0}, time) for step, time in slow + quick]
     monkeypatch.setattr("time.time", lambda: 9043.0)
-    assert time_left(log, 1900) == pytest.approx(600 * 0.1 - 3)
-    assert time_left(log[:1], 1900) is None
-    assert time_left(log, 1300) == 0
+    assert estimate_time_left(log, 1900) == pytest.approx(600 * 0.1 - 3)
+    assert estimate_time_left(log[:1], 1900) is None
+    assert estimate_time_left(log, 1300) == 0

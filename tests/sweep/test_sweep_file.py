@@ -32,10 +32,10 @@ WRONG: list[tuple[object, str]] = [
     ({"variants": {"a": {"overides": []}}}, "variants.a.overides: no such key; did you mean overrides?"),
     ({"variants": {"a": "memory=none"}}, "variants.a: 'memory=none'"),
     ({"variants": {"a": ["memory none"]}}, "variants.a: 'memory none'"),
-    ({"variants": {"a": ["seed=1"]}}, "the seeds are set by the key seeds"),
-    ({"variants": {"a": ["++seed=1"]}}, "the seeds are set by the key seeds"),
-    ({"variants": {"a\nb": []}}, "a label of one line"),
-    ({"variants": {1: [], "1": []}}, "variants: two have the same label"),
+    ({"variants": {"a": ["seed=1"]}}, "expected the key seeds for seeds"),
+    ({"variants": {"a": ["++seed=1"]}}, "expected the key seeds for seeds"),
+    ({"variants": {"a\nb": []}}, "a label in one line"),
+    ({"variants": {1: [], "1": []}}, "variants: two variants have the same label"),
     ({"variants": {"a": {"branch": "hips"}}}, "variants.a.branch: 'hips'"),
     ({"variants": {"a": {"branch": ["rotation"]}}}, "variants.a.branch: '['rotation']'"),
     ({"variants": {"a": {"against": "b"}, "c": []}}, "variants.a.against: 'b'"),
@@ -106,7 +106,7 @@ VALUES = st.recursive(
 @given(st.dictionaries(KEYS, VALUES, max_size=6))
 def test_whatever_stands_in_it_is_a_sweep_or_one_line(content):
     try:
-        said = str(len(parse_sweep("s", content).variant_seeds()))
+        said = str(len(parse_sweep("s", content).list_variant_seeds()))
     except InputError as error:
         said = str(error)
     assert said not in ("", "0")

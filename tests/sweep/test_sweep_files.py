@@ -14,7 +14,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from memmlp.config.compose import composed
+from memmlp.config.compose import compose_config
 from memmlp.runs.identity import flatten
 from memmlp.sweep.sweep_file import load_sweep
 
@@ -105,13 +105,13 @@ def test_the_decomposition_changes_one_ingredient_a_step():
     variants = {variant.label: variant for variant in DECOMPOSITION.variants}
     configs = {
         label: flatten(
-            OmegaConf.to_container(composed([*DECOMPOSITION.all_overrides(variant)]), resolve=True)
+            OmegaConf.to_container(compose_config([*DECOMPOSITION.merge_overrides(variant)]), resolve=True)
         )
         for label, variant in variants.items()
     }
     changed = {}
     for label, variant in variants.items():
-        control = DECOMPOSITION.control_of(variant)
+        control = DECOMPOSITION.find_control(variant)
         if control and label != "AGRoL-MLP-41":
             one, other = configs[label], configs[control]
             keys = {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}

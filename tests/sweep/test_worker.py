@@ -21,8 +21,8 @@ from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.common.lease import ChangeTimer
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
-from memmlp.sweep.plan import Entry, Plan, RunTask, unique
-from memmlp.sweep.worker import Cancelled, Presence, attempt, has_controller, work_off
+from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
+from memmlp.sweep.worker import Cancelled, Presence, has_controller, try_task, work_on_plan
 
 CODES = RunTask("c" * 16, "vqvae", {})
 ONE, TWO, ALONE = (
@@ -32,7 +32,7 @@ ONE, TWO, ALONE = (
 
 def plan(outputs: Path, *tasks: RunTask, **changes) -> Plan:
     entries = tuple(Entry(f"variant {task.id[0]}", 0, task.id) for task in tasks if task.kind == "memmlp")
-    return Plan("trial", outputs, entries, unique(tasks), **changes)
+    return Plan("trial", outputs, entries, order_tasks(tasks), **changes)
 
 
 def saved(outputs: Path, *tasks: RunTask, **changes) -> Path:
@@ -42,7 +42,7 @@ def saved(outputs: Path, *tasks: RunTask, **changes) -> Path:
 
 
 def finish(plan: Plan, task: RunTask) -> None:
-    run = plan.run_of(task)
+    run = plan.get_run(task)
     run.begin(task.kind, {}, data="d", prerequisite=task.prerequisite)
     run.results_path.write_text("{}")
     run.finish(["results.json"])
@@ -56,10 +56,10 @@ def test_prerequisite_runs_come_first_and_each_task_once(tmp_path: Path):
         seen.append(task.id)
         finish(plan, task)
 
-    work_off(saved(tmp_path, ONE, TWO, CODES, ALONE, ONE), perform)
+    work_on_plan(saved(tmp_path, ONE, TWO, CODES, ALONE, ONE), perform)
     assert sorted(seen) == sorted([ONE.id, TWO.id, CODES.id, ALONE.id])
     assert seen[0] == CODES.id
-    work_off(saved(tmp_path, ONE, TWO, CODES, ALONE), perform)
+    work_on_plan(saved(tmp_path, ONE, TWO, CODES, ALONE), perform)
     assert len(seen) == 4
 
 
@@ -76,16 +76,16 @@ def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):
         finish(plan, task)
 
     path = saved(tmp_path, CODES, ONE, TWO, ALONE)
-    work_off(path, perform)
+    work_on_plan(path, perform)
     now = Plan.load(path)
-    assert now.states() == {CODES.id: "done", ONE.id: "failed", TWO.id: "failed", ALONE.id: "failed"}
-    assert now.run_of(ONE).failure == "a bad key"
-    assert now.run_of(ALONE).failure == "ValueError: a bug"
-    assert now.left() == []
+    assert now.read_states() == {CODES.id: "done", ONE.id: "failed", TWO.id: "failed", ALONE.id: "failed"}
+    assert now.get_run(ONE).failure == "a bad key"
+    assert now.get_run(ALONE).failure == "ValueError: a bug"
+    assert now.list_remaining() == []
     del errors[ONE.id]
-    now.run_of(ONE).retry()
-    work_off(path, perform)
-    assert now.states()[ONE.id] == "done"
+    now.get_run(ONE).retry()
+    work_on_plan(path, perform)
+    assert now.read_states()[ONE.id] == "done"
 
 
 def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
@@ -93,24 +93,24 @@ def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
         raise InputError("no")
 
     path = saved(tmp_path, CODES, ONE, ALONE)
-    work_off(path, perform)
-    assert Plan.load(path).states() == {CODES.id: "failed", ONE.id: "blocked", ALONE.id: "failed"}
+    work_on_plan(path, perform)
+    assert Plan.load(path).read_states() == {CODES.id: "failed", ONE.id: "blocked", ALONE.id: "failed"}
     further = RunTask("f" * 16, "memmlp", {}, ONE.id)
     deeper = Plan.load(saved(tmp_path, CODES, ONE, further))
-    assert deeper.states() == {CODES.id: "failed", ONE.id: "blocked", further.id: "blocked"}
-    assert deeper.left() == []
+    assert deeper.read_states() == {CODES.id: "failed", ONE.id: "blocked", further.id: "blocked"}
+    assert deeper.list_remaining() == []
 
 
 def test_a_cancelled_run_is_left_as_it_is(tmp_path: Path):
     def perform(plan: Plan, task: RunTask) -> None:
-        plan.run_of(task).begin("memmlp", {}, data="d", prerequisite=None)
+        plan.get_run(task).begin("memmlp", {}, data="d", prerequisite=None)
         saved(tmp_path, ALONE, cancelled=(ALONE.id,))
         raise Cancelled
 
     path = saved(tmp_path, ALONE)
-    work_off(path, perform)
-    assert Plan.load(path).run_of(ALONE).status == "stopped"
-    assert Plan.load(path).left() == []
+    work_on_plan(path, perform)
+    assert Plan.load(path).get_run(ALONE).status == "stopped"
+    assert Plan.load(path).list_remaining() == []
 
 
 def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -124,7 +124,7 @@ def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkey
 
     looks: list[Path] = []
     monkeypatch.setattr(Plan, "load", lambda path, load=Plan.load: (looks.append(path), load(path))[1])
-    thread = threading.Thread(target=work_off, args=(path, perform), daemon=True)
+    thread = threading.Thread(target=work_on_plan, args=(path, perform), daemon=True)
     thread.start()
     until(lambda: len(looks) > 2, "it looks again")
     assert thread.is_alive()
@@ -134,7 +134,7 @@ def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkey
     thread.join(PATIENCE)
     assert not thread.is_alive()
     assert done == [ALONE.id]
-    work_off(saved(tmp_path, ONE, open=True), perform, wanted=lambda: False)
+    work_on_plan(saved(tmp_path, ONE, open=True), perform, should_continue=lambda: False)
     assert done == [ALONE.id]
 
 
@@ -142,42 +142,42 @@ def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkey
 def test_a_run_whose_process_died_is_lost_then_taken_over(tmp_path: Path):
     path = saved(tmp_path, ALONE)
     code = (
-        "import sys, time; from pathlib import Path; from memmlp.sweep.worker import work_off\n"
+        "import sys, time; from pathlib import Path; from memmlp.sweep.worker import work_on_plan\n"
         "def perform(plan, task):\n"
-        "    plan.run_of(task).begin('memmlp', {}, data='d', prerequisite=None)\n"
+        "    plan.get_run(task).begin('memmlp', {}, data='d', prerequisite=None)\n"
         "    print('at it', flush=True); time.sleep(600)\n"
-        "work_off(Path(sys.argv[1]), perform)"
+        "work_on_plan(Path(sys.argv[1]), perform)"
     )
     with started([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as victim:
         assert victim.stdout is not None
         victim.stdout.readline()
-        assert Plan.load(path).states()[ALONE.id] == "running"
-        assert not attempt(Plan.load(path), ALONE, finish)
+        assert Plan.load(path).read_states()[ALONE.id] == "running"
+        assert not try_task(Plan.load(path), ALONE, finish)
         victim.kill()
         victim.wait()
-    assert Plan.load(path).states()[ALONE.id] == "lost"
-    work_off(path, finish)
-    run = Plan.load(path).run_of(ALONE)
+    assert Plan.load(path).read_states()[ALONE.id] == "lost"
+    work_on_plan(path, finish)
+    run = Plan.load(path).get_run(ALONE)
     assert run.status == "done"
     assert len(run.manifest["attempts"]) == 2
 
 
 def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
     path = saved(tmp_path, ALONE)
-    run = Plan.load(path).run_of(ALONE)
-    for _ in range(worker.DEATHS - 1):
+    run = Plan.load(path).get_run(ALONE)
+    for _ in range(worker.MAX_DEATHS - 1):
         run.begin("memmlp", {}, data="d", prerequisite=None)
-    assert worker.count_deaths(run) == worker.DEATHS - 1
+    assert worker.count_deaths(run) == worker.MAX_DEATHS - 1
     run.log(5, {"loss": 1.0})
     assert worker.count_deaths(run) == 0
-    for _ in range(worker.DEATHS):
+    for _ in range(worker.MAX_DEATHS):
         run.begin("memmlp", {}, data="d", prerequisite=None)
-    work_off(path, finish)
+    work_on_plan(path, finish)
     assert run.status == "failed"
-    assert "processes died at step 5" in str(run.failure)
+    assert "processes in a row died at step 5" in str(run.failure)
     run.retry()
     assert worker.count_deaths(run) == 0
-    work_off(path, finish)
+    work_on_plan(path, finish)
     assert run.status == "done"
 
 
@@ -190,13 +190,13 @@ def _log_tasks(path: Path, log: Path, locks: bool) -> None:
     def perform(plan: Plan, task: RunTask) -> None:
         with open(log, "ab", buffering=0) as file:
             file.write(f"{task.id}\n".encode())
-        run = plan.run_of(task)
+        run = plan.get_run(task)
         run.begin(task.kind, {}, data="d", prerequisite=None)
         time.sleep(0.02)
         run.results_path.write_text("{}")
         run.finish(["results.json"])
 
-    work_off(path, perform)
+    work_on_plan(path, perform)
 
 
 @pytest.mark.parametrize("where", [lambda monkeypatch: None, apart])
@@ -211,7 +211,7 @@ def test_workers_do_each_task_once_where_locks_do_nothing(tmp_path: Path, monkey
         seen.append(task.id)
         finish(plan, task)
 
-    threads = [threading.Thread(target=work_off, args=(path, perform)) for _ in range(3)]
+    threads = [threading.Thread(target=work_on_plan, args=(path, perform)) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -226,10 +226,10 @@ def test_a_full_disk_is_no_runs_failure(tmp_path: Path, code: int):
 
     path = saved(tmp_path, ALONE)
     with pytest.raises(OSError, match=os.strerror(code)):
-        work_off(path, perform)
-    assert Plan.load(path).states() == {ALONE.id: "new"}
-    work_off(path, finish)
-    assert Plan.load(path).states() == {ALONE.id: "done"}
+        work_on_plan(path, perform)
+    assert Plan.load(path).read_states() == {ALONE.id: "new"}
+    work_on_plan(path, finish)
+    assert Plan.load(path).read_states() == {ALONE.id: "done"}
 
 
 def test_a_controller_elsewhere_is_dead_once_it_has_not_been_seen_for_long(tmp_path: Path, monkeypatch):
@@ -256,15 +256,15 @@ def test_presence_ends_with_its_process(tmp_path: Path):
     with started([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()
-        assert Presence.of(path)
+        assert Presence.is_alive(path)
         process.kill()
         process.wait()
-    assert not Presence.of(path)
+    assert not Presence.is_alive(path)
 
 
 def test_a_plan_that_is_none_is_one_line(tmp_path: Path):
     path = tmp_path / "plan.json"
     for text in ("", "[]", "{}", '{"entries": [{}], "tasks": [], "cancelled": []}'):
         path.write_text(text)
-        with pytest.raises(InputError, match=r"plan\.json: not a sweep's plan"):
+        with pytest.raises(InputError, match=r"plan\.json: must be the plan of a sweep"):
             Plan.load(path)

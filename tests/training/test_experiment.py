@@ -15,7 +15,7 @@ import torch
 from omegaconf import OmegaConf
 
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import composed
+from memmlp.config.compose import compose_config
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.motion.dataset import MotionDataset
 from memmlp.runs.identity import NEUTRAL, flatten
@@ -135,7 +135,7 @@ def base(home: Path) -> Outcome:
 
 def outcome(folder: Path, overrides: list[str]) -> Outcome:
     """Make everything but the data in an empty folder, so that no run can be found by a wrong identity."""
-    experiment = build_experiment(composed([*BASE, *overrides]))
+    experiment = build_experiment(compose_config([*BASE, *overrides]))
     experiment.config["paths"]["outputs"] = str(folder)
     data = experiment.motion.prepare()
     identity = experiment.identity(data.digest)
@@ -185,7 +185,7 @@ def digest(value: Any) -> str:
 
 def test_every_key_is_changed_or_said_not_to_be():
     """The profile's sizes are not changed here, since they act through the groups' keys, which are."""
-    config = flatten(OmegaConf.to_container(composed(BASE), resolve=True))  # type: ignore[arg-type]
+    config = flatten(OmegaConf.to_container(compose_config(BASE), resolve=True))  # type: ignore[arg-type]
     own = {key for key in config if key.rsplit(".", 1)[-1] != "name"}
     own |= {"data.name"}  # a slot's own name is fixed
     assert {key for key in own if not key.startswith("profile.")} == CHANGES.keys() | UNTRIED.keys()

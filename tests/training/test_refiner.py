@@ -8,8 +8,8 @@ import pytest
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
-from memmlp.config.build import build_experiment, config_of
-from memmlp.config.compose import composed
+from memmlp.config.build import build_experiment, load_config
+from memmlp.config.compose import compose_config
 from memmlp.networks.refiner import RefinedModel
 from memmlp.runs.lookup import list_runs
 from memmlp.training.run_stages import run_in_processes
@@ -37,12 +37,12 @@ def test_one_command_trains_the_network_and_then_its_refiner(memmlp):
     assert set(refined.results) == {"window", "stream"}
     assert refined.results["window"] == refined.results["stream"]
     assert refined.results["stream"]["rotation"]["MPJPE"] != bare.results["stream"]["rotation"]["MPJPE"]
-    assert isinstance(build_experiment(config_of(refined)).architecture.load(refined.model), RefinedModel)
+    assert isinstance(build_experiment(load_config(refined)).architecture.load(refined.model), RefinedModel)
     assert "finished already" in memmlp("train", *SHORT, "refiner=sage").out
 
 
 def experiment(*overrides: str):
-    return build_experiment(composed([*SHORT, *overrides]))
+    return build_experiment(compose_config([*SHORT, *overrides]))
 
 
 @pytest.mark.slow

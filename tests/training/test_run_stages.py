@@ -20,8 +20,8 @@ from PIL import Image
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.files import file_digest
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import composed
-from memmlp.config.plugins import packaged
+from memmlp.config.compose import compose_config
+from memmlp.config.plugins import find_packaged_folder
 from memmlp.motion.dataset import MotionDataset
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.runs import environment
@@ -83,7 +83,7 @@ def test_a_run_leaves_everything(home):
 
 def test_data_without_test_clips_is_refused_before_the_training(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    experiment = build_experiment(composed([*TINY, "memory=none", "data.split.test=0"]))
+    experiment = build_experiment(compose_config([*TINY, "memory=none", "data.split.test=0"]))
     with pytest.raises(InputError, match="no test clips"):
         run_stages.run_experiment(experiment)
     assert not list_runs(tmp_path / "outputs")
@@ -125,7 +125,7 @@ def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
     both = ("memory.blend=1", "export.precision=fp32", "export.graph=naive")
     assert "evaluation and deployment done" in command(home, "eval", run.id, *both)
     assert "measured before" in command(home, "eval", run.id, "evaluation.ik=off", INT8)
-    assert "changes the training" in command(home, "eval", run.id, "memory.shift=frame", code=2)
+    assert "would change the training" in command(home, "eval", run.id, "memory.shift=frame", code=2)
     assert "evaluation.ik" in command(home, "eval", run.id, "evaluation.ik=[", code=2)
     assert "evaluation.ik=guess" in command(home, "eval", run.id, "evaluation.ik=guess", code=2)
     assert (run.model.read_bytes(), run.metrics_path.read_bytes()) == (weights, log)
@@ -166,11 +166,13 @@ def test_changed_weights_are_not_evaluated_and_what_is_exported_is_checked_on_th
     assert "changed since the training" in command(home, "eval", str(copy.folder), "--again", code=2)
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in packaged("conf/experiment").glob("*.yaml")))
+@pytest.mark.parametrize(
+    "name", sorted(path.stem for path in find_packaged_folder("conf/experiment").glob("*.yaml"))
+)
 def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.MonkeyPatch):
     """Two steps and one validation of each, on the prepared data, without export."""
     monkeypatch.chdir(home)
-    cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
+    cfg = compose_config([f"experiment={name}", *TINY, "optim.steps=2"])
     experiment = build_experiment(cfg)
     data = experiment.motion.prepare()
     above = make_prerequisites(experiment, data)

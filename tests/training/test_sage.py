@@ -9,8 +9,8 @@ import torch
 from omegaconf import OmegaConf
 
 from memmlp.common.errors import InputError
-from memmlp.config.build import build_experiment, config_of
-from memmlp.config.compose import composed
+from memmlp.config.build import build_experiment, load_config
+from memmlp.config.compose import compose_config
 from memmlp.networks import checkpoint
 from memmlp.networks.sage_net import SAGENet
 from memmlp.runs.lookup import check_trained, list_runs
@@ -45,7 +45,7 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     assert [one["id"] for one in chain[-1].manifest["prerequisite_runs"]] == above
     assert [run.manifest["name"].partition(" ·")[0] for run in chain[:2]] == ["upper codes", "lower codes"]
     whole = chain[-1]
-    assert isinstance(build_experiment(config_of(whole)).architecture.load(whole.model), SAGENet)
+    assert isinstance(build_experiment(load_config(whole)).architecture.load(whole.model), SAGENet)
     errors = [whole.results[mode]["rotation"]["MPJPE"] for mode in ("window", "stream")]
     assert errors[0] == pytest.approx(errors[1], rel=0.01)  # every frame is the last one of its own window
     # what is finished stays as it is, until the whole is trained
@@ -63,7 +63,7 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     # a part alone that is gone is made again, with the same weights
     weights = chain[2].model.read_bytes()
     chain[2].reset()
-    experiment = build_experiment(composed(SHORT))
+    experiment = build_experiment(compose_config(SHORT))
     made = make_prerequisites(experiment, experiment.motion.prepare(), chain[2].id)
     assert (made.id, made.model.read_bytes()) == (chain[2].id, weights)
     assert "finished already" in memmlp("train", *SHORT).out
@@ -88,7 +88,7 @@ FIRST = {
 
 @pytest.mark.slow
 def test_a_key_changes_the_runs_in_which_it_acts_and_all_that_build_upon_them():
-    cfg = composed(SHORT)
+    cfg = compose_config(SHORT)
     before = chain_of(cfg)
     assert len(set(before)) == 6
     for key, (value, first) in FIRST.items():

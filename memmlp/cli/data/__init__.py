@@ -83,11 +83,11 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
     from omegaconf import OmegaConf
 
     from memmlp.config.build_request import build_motion
-    from memmlp.config.compose import composed
+    from memmlp.config.compose import compose_config
     from memmlp.motion.preparing.cache import prepare as prepare_cache
 
     has_protocol = any(override.startswith("data=") for override in overrides)
-    cfg = composed([*([] if has_protocol else ["data=mocap"]), *overrides, "data.root=."])
+    cfg = compose_config([*([] if has_protocol else ["data=mocap"]), *overrides, "data.root=."])
     OmegaConf.update(cfg, "data.root", str(root))
     show_manifest(prepare_cache(build_motion(cfg).clips, out))
 

@@ -60,7 +60,7 @@ def import_(
     SOURCE is a folder or one file. Each clip is converted to the 22-joint tree and compared with its file.
     The command reports faults.
     """
-    from memmlp.config.plugins import grouping_to_choose
+    from memmlp.config.plugins import choose_grouping
     from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
     settings = ImportSettings(skeleton, _parse_rates(fps), body, _parse_floor(floor), strict, sound, up)
@@ -73,7 +73,7 @@ def import_(
     seconds = sum(clip.frames / clip.fps for clip in report.clips)
     maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
     click.echo(f"{describe_amount(len(report.clips), seconds)}, skeleton {maps}, in {out}")
-    grouping = grouping_to_choose([Path(clip.clip).with_suffix("").as_posix() for clip in report.clips])
+    grouping = choose_grouping([Path(clip.clip).with_suffix("").as_posix() for clip in report.clips])
     group_overrides = [f"data/grouping@data.split={grouping}"] if grouping else []
     click.echo("next: " + shlex.join(["memmlp", "train", "data=mocap", f"data.root={out}", *group_overrides]))
 

@@ -40,8 +40,8 @@ def make_run_finder(plan: Plan, read: ReadRun) -> FindRun:
 
     def find(variant: Variant, seed: int) -> MeasuredRun | None:
         entry = entries.get((variant.label, seed))
-        complete = entry is not None and plan.complete(entry)
-        return read(plan.run_of(entry).folder, entry.stages) if entry and complete else None
+        complete = entry is not None and plan.is_complete(entry)
+        return read(plan.get_run(entry).folder, entry.stages) if entry and complete else None
 
     return find
 
@@ -54,8 +54,8 @@ def make_state_finder(plan: Plan) -> DescribeRun:
         entry = entries.get((variant.label, seed))
         if entry is None:
             return None
-        run = plan.run_of(entry)
-        state = run.activity or run.state(plan.complete(entry))
+        run = plan.get_run(entry)
+        state = run.activity or run.state(plan.is_complete(entry))
         if state == "trained":
             return "trained, an evaluation or export is missing"
         return state if state not in ("new", "done") else None
@@ -67,9 +67,9 @@ def find_finished_runs(sweep: Sweep, find: FindRun) -> dict[str, RunsBySeed]:
     """Return the finished runs by variant label and seed."""
     return {
         variant.label: {
-            seed: run for seed in sweep.seeds_of(variant) if (run := find(variant, seed)) is not None
+            seed: run for seed in sweep.get_seeds(variant) if (run := find(variant, seed)) is not None
         }
-        for variant in sweep.runnable()
+        for variant in sweep.list_runnable()
     }
 
 
@@ -147,7 +147,7 @@ def _make_row(
         against=control.label if control else None,
         note=variant.note,
         found=tuple(runs or ()),
-        wanted=sweep.seeds_of(variant) if runs is not None else (),
+        wanted=sweep.get_seeds(variant) if runs is not None else (),
         cells={mode: {metric: make_cell(mode, metric) for metric in sweep.metrics} for mode in modes},
         pairing=pairing,
     )
@@ -155,7 +155,7 @@ def _make_row(
 
 def make_empty_table(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     """Make a table with only the paper's values, and flag the reason why runs can't be identified."""
-    runs: dict[str, RunsBySeed] = {variant.label: {} for variant in sweep.runnable()}
+    runs: dict[str, RunsBySeed] = {variant.label: {} for variant in sweep.list_runnable()}
     return replace(make_table(sweep, runs, modes), flags=(reason,))
 
 

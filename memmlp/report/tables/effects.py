@@ -51,13 +51,13 @@ class PairedDifferences(NamedTuple):
 
 def find_control(sweep: Sweep, variant: Variant) -> Variant | None:
     """Return a variant's control; None for the sweep's control and for rows with only printed values."""
-    label = sweep.control_of(variant) if variant.overrides is not None else None
+    label = sweep.find_control(variant) if variant.overrides is not None else None
     return next((other for other in sweep.variants if other.label == label), None)
 
 
 def list_comparisons(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
     """Yield each variant that has a control, with its control."""
-    for variant in sweep.runnable():
+    for variant in sweep.list_runnable():
         other = find_control(sweep, variant)
         if other is not None:
             yield variant, other
@@ -104,7 +104,7 @@ def compute_effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequenc
     """
     printed = {
         Key(variant.label, mode, metric): find_paper_effect(sweep, variant, metric)
-        for variant, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
+        for variant, mode, metric in itertools.product(sweep.list_runnable(), modes, sweep.metrics)
     }
     return _compare_costs(sweep, runs, modes) | _add_verdicts(
         estimate_effects(pair_differences(sweep, runs, modes), sweep.smallest, sensitivity=True),

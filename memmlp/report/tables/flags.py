@@ -59,7 +59,9 @@ def find_flags(
         command: the command that makes missing runs.
         state: describes the state of an unfinished run.
     """
-    every = [(variant.label, run) for variant in sweep.runnable() for run in runs[variant.label].values()]
+    every = [
+        (variant.label, run) for variant in sweep.list_runnable() for run in runs[variant.label].values()
+    ]
     has_errors = bool(set(sweep.metrics) - set(COSTS))
     yield from _flag_other_data(sweep)
     yield from _flag_missing_runs(sweep, runs, command, state)
@@ -104,7 +106,7 @@ def flag_early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[
 
     A test now and another test later inflate the false-positive rate.
     """
-    several = [one for one in sweep.runnable() if len(runs[one.label]) > 1]
+    several = [one for one in sweep.list_runnable() if len(runs[one.label]) > 1]
     if early := [one.label for one in several if find_missing_seeds(sweep, one, runs)]:
         yield (
             "seeds are missing: repeated tests as they come give false positives more often than 1 in 20 "
@@ -114,7 +116,7 @@ def flag_early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[
 
 def find_missing_seeds(sweep: Sweep, variant: Variant, runs: Mapping[str, RunsBySeed]) -> list[int]:
     """Return a variant's planned seeds without a finished run."""
-    return [seed for seed in sweep.seeds_of(variant) if seed not in runs[variant.label]]
+    return [seed for seed in sweep.get_seeds(variant) if seed not in runs[variant.label]]
 
 
 def flag_older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> Iterator[str]:
@@ -188,12 +190,12 @@ def _flag_missing_runs(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: DescribeRun
 ) -> Iterator[str]:
     lacking: dict[str, str] = {}
-    for variant in sweep.runnable():
+    for variant in sweep.list_runnable():
         if seeds := find_missing_seeds(sweep, variant, runs):
             states = drop_repeats(text for seed in seeds if (text := state(variant, seed)))
             described = f" ({', '.join(states)})" if states else ""
             lacking[variant.label] = f"seed {', '.join(map(str, seeds))}{described}"
-    alike = 1 < len(sweep.runnable()) == len(lacking) and len(set(lacking.values())) == 1
+    alike = 1 < len(sweep.list_runnable()) == len(lacking) and len(set(lacking.values())) == 1
     if lacking:
         gaps = join_first([f"'{label}' {gap}" for label, gap in lacking.items()])
         gaps = f"every variant's {next(iter(lacking.values()))}" if alike else gaps
@@ -204,14 +206,14 @@ def _flag_branches(
     sweep: Sweep, requested: Sweep, runs: Mapping[str, RunsBySeed], command: str
 ) -> Iterator[str]:
     wanted = {variant.label: variant.branch for variant in requested.variants}
-    other = [one for one in sweep.runnable() if one.branch != wanted[one.label]]
+    other = [one for one in sweep.list_runnable() if one.branch != wanted[one.label]]
     if other:
         labels, branches = (
             join_quoted(one.label for one in other),
             join_first(drop_repeats(one.branch for one in other)),
         )
         yield f"the network has no other branch, so the row shows {branches}: {labels}"
-    every = [(one, run) for one in sweep.runnable() for run in runs[one.label].values()]
+    every = [(one, run) for one in sweep.list_runnable() for run in runs[one.label].values()]
     if lacking := [one for one, run in every if not run.has_branch(one.branch)]:
         branches, labels = (
             join_first(drop_repeats(a.branch for a in lacking)),
@@ -255,7 +257,7 @@ def _flag_unequal_groups(labelled_runs: LabelledRuns) -> Iterator[str]:
 def _flag_unmeasured_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     """Flag runs without a metric that other seeds of the same variant have."""
     lacking: dict[tuple[str, int], list[str]] = defaultdict(list)
-    for variant in sweep.runnable():
+    for variant in sweep.list_runnable():
         found = runs[variant.label]
         modes = sorted({mode for run in found.values() for mode in run.means}) or [""]
         for metric, mode in itertools.product(sweep.metrics, modes):
@@ -277,7 +279,7 @@ def _flag_diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterato
     """
     lost: dict[tuple[str, int], set[str]] = defaultdict(set)
     every = [
-        (variant, seed, run) for variant in sweep.runnable() for seed, run in runs[variant.label].items()
+        (variant, seed, run) for variant in sweep.list_runnable() for seed, run in runs[variant.label].items()
     ]
     modes = {mode for _, _, run in every for mode in run.means}
 
@@ -309,7 +311,7 @@ def _flag_smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> I
     Variants that were tested on different clips are flagged in separate lines.
     """
     smoother: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for variant in sweep.runnable():
+    for variant in sweep.list_runnable():
         found = list(runs[variant.label].values())
         for mode in sorted({mode for run in found for mode in run.means}):
             values = (
@@ -359,7 +361,7 @@ def _flag_unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iter
 
 def _flag_busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     found, fewer = [], []
-    for variant in sweep.runnable():
+    for variant in sweep.list_runnable():
         label, counted = variant.label, select_undisturbed_runs(runs[variant.label])
         shares = [share for run in counted.values() if (share := find_core_share(run)) is not None]
         ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]

@@ -146,7 +146,7 @@ class Rounds:
         the seeds of all variants that are compared with it.
         """
         upcoming = self.find_next_analyses(sweep)
-        found = {variant.label: self.schedule[0] for variant in sweep.runnable()}
+        found = {variant.label: self.schedule[0] for variant in sweep.list_runnable()}
         for variant, other in _list_comparisons(sweep):
             number = upcoming.get(variant.label, self.count_analyses(variant.label) - 1)
             for label in (variant.label, other.label):
@@ -223,10 +223,10 @@ def describe_subject(sweep: Sweep) -> dict[str, Any]:
         "variants": {
             variant.label: {
                 "branch": variant.branch,
-                "against": sweep.control_of(variant),
+                "against": sweep.find_control(variant),
                 "paper": {metric: find_paper_effect(sweep, variant, metric) for metric in sweep.metrics},
             }
-            for variant in sweep.runnable()
+            for variant in sweep.list_runnable()
         },
         "metrics": list(sweep.metrics),
         "smallest": {name: sweep.smallest[name] for name in sweep.metrics if name in sweep.smallest},

@@ -93,7 +93,12 @@ def _describe_search(folder: Path) -> dict[str, Any]:
 def _describe_study(study: optuna.Study) -> dict[str, Any]:
     from optuna.trial import TrialState
 
-    from memmlp.sweep.search.results import IMPORTANCE, boundary_warnings, importances, too_few_trials
+    from memmlp.sweep.search.results import (
+        IMPORTANCE,
+        compute_importances,
+        explain_missing_importances,
+        find_boundary_warnings,
+    )
 
     trials = [trial for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.WAITING]
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
@@ -109,17 +114,17 @@ def _describe_study(study: optuna.Study) -> dict[str, Any]:
         "front": front,
         "best": [_describe_trial(trial) for trial in complete if trial.number in front][:1],
         "trials": [_describe_trial(trial) for trial in trials],
-        "ends": boundary_warnings(study),
+        "ends": find_boundary_warnings(study),
         "importance_is": IMPORTANCE,
-        "too_few": too_few_trials(study),
-        "importance": [[key, round(share, 4)] for key, share in importances(study)],
+        "too_few": explain_missing_importances(study),
+        "importance": [[key, round(share, 4)] for key, share in compute_importances(study)],
     }
 
 
 def _describe_trial(trial: FrozenTrial) -> dict[str, Any]:
     from optuna.trial import TrialState
 
-    from memmlp.sweep.search.study import reason
+    from memmlp.sweep.search.study import get_reason
 
     # For a pruned trial, Optuna has the value of the last step, which is not a result.
     values = trial.values if trial.state == TrialState.COMPLETE else []
@@ -129,5 +134,5 @@ def _describe_trial(trial: FrozenTrial) -> dict[str, Any]:
         "values": [value if math.isfinite(value) else None for value in values],
         "params": trial.params,
         "runs": list(trial.user_attrs.get("runs", ())),
-        "reason": reason(trial),
+        "reason": get_reason(trial),
     }

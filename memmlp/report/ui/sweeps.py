@@ -32,7 +32,7 @@ from memmlp.runs.identity import NETWORK, find_training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, load_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.progress_table import task_name
+from memmlp.sweep.progress_table import describe_task
 
 DAMAGED_ROUNDS = "seed rounds cannot be read: error probabilities of these verdicts may exceed 5 %"
 OTHER_ROUNDS = "seed rounds belong to other runs: error probabilities of these verdicts may exceed 5 %"
@@ -104,7 +104,7 @@ class Sweeps:
                 self._describe_cell(e, states[e.key], values.get((e.label, e.seed))) for e in plan.entries
             ],
             "prerequisites": [
-                {"name": task_name(plan, task), "id": task.id, "state": states[task.key]}
+                {"name": describe_task(plan, task), "id": task.id, "state": states[task.key]}
                 for task in plan.tasks
                 if task.kind != NETWORK
             ],
@@ -139,7 +139,7 @@ class Sweeps:
         """
         for plan, sweep, _ in self.known.values():
             ids = {(entry.label, entry.seed): entry.id for entry in plan.entries}
-            controls = {variant.label: sweep.control_of(variant) for variant in sweep.variants}
+            controls = {variant.label: sweep.find_control(variant) for variant in sweep.variants}
             for label, seed in [place for place, used in ids.items() if used == run_id]:
                 control = ids.get((controls.get(label) or "", seed), run_id)
                 if control != run_id and control in self.index.runs:
@@ -148,7 +148,7 @@ class Sweeps:
 
     def find_states(self, plan: Plan) -> dict[str, str]:
         """Return task states by key, like `Plan.states`, but from the facts in the index."""
-        return plan.with_blocked({task.key: self._find_state(plan, task) for task in plan.tasks})
+        return plan.mark_blocked({task.key: self._find_state(plan, task) for task in plan.tasks})
 
     def _find_state(self, plan: Plan, task: RunTask) -> str:
         facts = self.index.runs.get(task.id)
@@ -156,7 +156,7 @@ class Sweeps:
             return "new"
         if not facts["done"] or facts["status"] not in ("done", "trained", "lost"):
             return facts["status"]
-        run = plan.run_of(task)
+        run = plan.get_run(task)
         return "done" if all(map(run.has, task.stages)) else run.activity or run.state(False)
 
     def _describe_cell(self, entry: Entry, state: str, value: float | None) -> dict[str, Any]:
@@ -210,10 +210,10 @@ class Sweeps:
 
         def find(variant: Variant, seed: int) -> MeasuredRun | None:
             entry = entries.get((variant.label, seed))
-            if entry is None or not plan.complete(entry):
+            if entry is None or not plan.is_complete(entry):
                 return None
             try:
-                run = load_measured_run(plan.run_of(entry).folder, entry.stages)
+                run = load_measured_run(plan.get_run(entry).folder, entry.stages)
                 # Variants with the same trained network may have different evaluations.
                 value = run.get_value("stream", variant.branch, metric)
             except InputError as error:

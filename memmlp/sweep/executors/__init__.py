@@ -1,6 +1,6 @@
 """Executors start workers: processes, jobs of a Slurm cluster, or tasks of Ray or Dask.
 
-The workers settle among themselves which of them does which run (`memmlp.sweep.worker`).
+Each worker chooses its runs itself (`memmlp.sweep.worker`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from memmlp.common.errors import InputError
 
 Work = Callable[[], str | None]
-"""A worker's work. It returns None at its end, or a line that says why this worker could do no work."""
+"""The function that a worker calls. It returns None, or a line that explains why it could not work."""
 
 
 class Handle(Protocol):
@@ -24,7 +24,7 @@ class Handle(Protocol):
         """End the worker."""
 
     def complaint(self) -> str | None:
-        """Return the worker's own line about why it could do no work; None after any other end."""
+        """Return the line that explains why the worker could not work; None after any other end."""
 
 
 class Executor(Protocol):
@@ -37,7 +37,7 @@ class Executor(Protocol):
     gpus: bool
 
     def submit(self, work: Work, count: int = 1) -> Sequence[Handle]:
-        """Start `count` workers; `work` must be picklable, and importable on the workers' machines."""
+        """Start `count` workers. `work` must be picklable, and importable on the workers' machines."""
 
 
 def parse_settings(
@@ -47,12 +47,12 @@ def parse_settings(
 
     Args:
         executor: the executor's name.
-        settings: the settings as they were given.
-        parsers: by key what parses its value, or raises ValueError with what it must be. A key "GROUP.NAME"
-            stands for any name; the values of such a group are a dict.
+        settings: the texts of the values by key.
+        parsers: a function for each key, which parses the value or raises ValueError. A key "GROUP.NAME"
+            accepts any name; the result has a dict of the group's values.
 
     Raises:
-        InputError: for an unknown key or a value of the wrong kind.
+        InputError: for an unknown key or an invalid value.
     """
     parsed: dict[str, Any] = {}
     for key, text in settings.items():
@@ -72,7 +72,7 @@ def parse_settings(
 
 
 def parse_amount(text: str) -> float:
-    """Return the number in a text. Raises ValueError for a text that is not a number, or one below 0."""
+    """Return the number in a text. Raises ValueError unless the text is a number of at least 0."""
     if not text.replace(".", "", 1).isdecimal():
-        raise ValueError("must be a number, at least 0")
+        raise ValueError("must be a number of at least 0")
     return float(text)

@@ -1,7 +1,7 @@
-"""Workers that are tasks of a Dask cluster, each with a process of its own.
+"""Workers that are tasks of a Dask cluster, each in a separate process.
 
-Dask runs tasks in threads of one process, where they would share torch's random numbers and number of
-threads, and could not be ended. So each task starts a process and watches it.
+Dask runs tasks in threads of a process. Threads would share torch's random numbers and thread count, and
+cannot be ended. Therefore each task starts a process and monitors it.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from memmlp.sweep.executors import Work, parse_amount
 from memmlp.sweep.executors.local import LINE, VISIBLE, start_process
 
 SETTINGS: Mapping[str, Callable[[str], Any]] = {"address": str, "resources.NAME": parse_amount}
-"""The settings `dask.KEY`: the scheduler's address, by default that in DASK_SCHEDULER_ADDRESS; and how much
-each of our workers takes of the resources of Dask's workers, by name."""
-GPU = "GPU"  # the resource by which Dask's workers declare their GPU
-PAUSE = 1.0  # seconds between checks whether a worker is to be ended
+"""The settings `dask.KEY`. `address`: the scheduler's address, by default DASK_SCHEDULER_ADDRESS.
+`resources.NAME`: the amount of a Dask resource that each memmlp worker takes."""
+GPU = "GPU"  # the resource with which Dask workers declare their GPU
+PAUSE = 1.0  # seconds between two checks for the stop event
 
 
 class DaskTask:
@@ -30,7 +30,7 @@ class DaskTask:
 
     Args:
         future: the task.
-        stop: the event (`distributed.Event`) upon which the task ends its process.
+        stop: the `distributed.Event` that makes the task end its process.
     """
 
     def __init__(self, future: Any, stop: Any):
@@ -41,12 +41,12 @@ class DaskTask:
         return self.future.status == "pending"
 
     def cancel(self) -> None:
-        """End the task's process, or withdraw the task if it is still waiting."""
+        """End the task's process, or cancel the task if it is still waiting."""
         self.stop.set()
         self.future.cancel()
 
     def complaint(self) -> str | None:
-        """Return the worker's own line about why it could do no work; None after any other end."""
+        """Return the line that explains why the worker could not work; None after any other end."""
         return self.future.result() if self.future.status == "finished" else None
 
 
@@ -55,17 +55,17 @@ class Dask:
 
     Args:
         options: the parsed SETTINGS.
-        gpus: whether workers get a GPU, if the options do not say so and the cluster declares GPUs.
+        gpus: whether workers get a GPU if the cluster declares GPUs; the option `resources.GPU` has priority.
 
     Raises:
-        InputError: if Dask is not installed, or the cluster is not named or can't be reached.
+        InputError: if Dask is not installed, the address is missing, or the cluster cannot be reached.
     """
 
     def __init__(self, options: Mapping[str, Any], gpus: bool = True):
         self.distributed: Any = import_optional("distributed", "dask", "executor=dask")
         address = options.get("address") or os.environ.get("DASK_SCHEDULER_ADDRESS")
         if not address:
-            raise InputError("executor=dask: dask.address=HOST:PORT of a scheduler is missing")
+            raise InputError("executor=dask: expected the scheduler's address, dask.address=HOST:PORT")
         try:
             self.client = self.distributed.Client(address, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -75,27 +75,29 @@ class Dask:
         self.resources = ({GPU: 1.0} if gpus and declared else {}) | options.get("resources", {})
         self.gpus = self.resources.get(GPU, 0) > 0
         if gpus and not self.gpus:
-            line = "no worker declares a GPU (dask worker --resources GPU=1): runs have none"
+            line = "no Dask worker declares a GPU, so runs use no GPU (dask worker --resources GPU=1)"
             print(f"memmlp: executor=dask: {line}", file=sys.stderr, flush=True)
 
     def submit(self, work: Work, count: int = 1) -> list[DaskTask]:
-        """Start workers; those that the cluster has no resources for wait."""
+        """Start workers. A worker waits until the cluster has its resources."""
         started = []
         for _ in range(count):
             name = f"memmlp-{uuid.uuid4().hex}"
-            wanted = {"resources": dict(self.resources)} if self.resources else {}
-            future = self.client.submit(_work_apart, work, name, self.gpus, key=name, pure=False, **wanted)
+            resources = {"resources": dict(self.resources)} if self.resources else {}
+            future = self.client.submit(
+                _work_in_process, work, name, self.gpus, key=name, pure=False, **resources
+            )
             started.append(DaskTask(future, self.distributed.Event(name, self.client)))
         return started
 
 
-def _work_apart(work: Work, stop: str, gpus: bool) -> str | None:
-    """Do the work in a separate process, which ends with this one, or when the event `stop` is set."""
+def _work_in_process(work: Work, stop: str, gpus: bool) -> str | None:
+    """Do the work in a separate process, which ends with this process, or when the event `stop` is set."""
     from distributed import Event, get_worker
 
     declared = get_worker().state.total_resources.get(GPU, 0)
-    if gpus and declared > 1:  # it is unknown which of them is this task's
-        return f"a Dask worker declares {declared:g} GPUs; must be one, each with its CUDA_VISIBLE_DEVICES"
+    if gpus and declared > 1:  # Dask does not assign a certain GPU to the task
+        return f"a Dask worker declares {declared:g} GPUs; expected 1, with CUDA_VISIBLE_DEVICES set for it"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with start_process(work, folder, {} if gpus else {VISIBLE: ""}, with_parent=True) as process:

@@ -1,4 +1,4 @@
-"""Workers that are processes of this machine, and how its GPUs are divided among them."""
+"""Workers that are processes of this machine, and the division of its GPUs among workers."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from memmlp.common.processes import (
 from memmlp.sweep.executors import Work
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-WORK, LINE = "work.pickle", "line.txt"  # files of a worker's folder: its work, and the line that it returns
+WORK, LINE = "work.pickle", "line.txt"  # files of a worker's folder: the pickled work, and the returned line
 
-Share = tuple[str, ...]
-"""The GPUs of one worker, by their names in CUDA_VISIBLE_DEVICES; empty for a worker without GPUs."""
+GpuGroup = tuple[str, ...]
+"""The names, as in CUDA_VISIBLE_DEVICES, of a worker's GPUs; empty for a worker without GPUs."""
 
 
-def visible_gpus() -> Share:
-    """Return the names of the GPUs that this process may use, in the form of CUDA_VISIBLE_DEVICES.
+def list_visible_gpus() -> GpuGroup:
+    """Return the names of the GPUs that this process may use, as in CUDA_VISIBLE_DEVICES.
 
-    As in CUDA, a name below 0 hides that entry and all that follow.
+    Like in CUDA, a negative number hides its entry and all later entries.
     """
     text = os.environ.get(VISIBLE)
     if text is None:
@@ -41,39 +41,41 @@ def visible_gpus() -> Share:
     return tuple(itertools.takewhile(lambda name: not name.startswith("-"), names))
 
 
-def divide_gpus(gpus: Share, per_worker: int | None = None) -> list[Share]:
-    """Divide the GPUs into shares of `per_worker` GPUs, one share for each worker; a remainder is idle.
+def divide_gpus(gpus: GpuGroup, per_worker: int | None = None) -> list[GpuGroup]:
+    """Divide the GPUs into groups of `per_worker` GPUs, one group for each worker. The rest stays idle.
 
     Args:
         gpus: the visible GPUs.
-        per_worker: GPUs of a worker; None for 1 if there are GPUs. With 0 there are no shares.
+        per_worker: the number of GPUs per worker; None for 1 if there are GPUs. With 0 there are no groups.
 
     Raises:
-        InputError: if a worker would have more GPUs than there are.
+        InputError: if `per_worker` is greater than the number of GPUs.
     """
     size = per_worker if per_worker is not None else min(len(gpus), 1)
     if size > len(gpus):
         names = ", ".join(gpus) or "no GPU"
-        raise InputError(f"--gpus-per-worker {size}: must be at most {len(gpus)}; visible here: {names}")
+        raise InputError(
+            f"--gpus-per-worker {size}: must be at most {len(gpus)}, the number of visible GPUs ({names})"
+        )
     return [gpus[i : i + size] for i in range(0, len(gpus) - size + 1, size)] if size else []
 
 
-def worker_count(shares: Sequence[Share], workers: int | None, per_gpu: int | None) -> int:
-    """Return how many workers run at once.
+def count_workers(gpu_groups: Sequence[GpuGroup], workers: int | None, per_gpu: int | None) -> int:
+    """Return the number of workers that run at once.
 
     Args:
-        shares: the shares of GPUs that a worker may get; empty if workers have no GPUs.
-        workers: how many were asked for; None for one per core, or with GPUs one per share.
-        per_gpu: the largest number of workers per share; None for as many as are needed.
+        gpu_groups: the GPU groups that workers may get; empty if workers have no GPUs.
+        workers: the requested number; None for one per GPU group, or without GPUs one per core.
+        per_gpu: the maximum number of workers per GPU group; None for no limit.
 
     Raises:
-        InputError: if that is more than the shares allow, or if there are no GPUs to share.
+        InputError: if the number exceeds `per_gpu`, or if `per_gpu` is given without GPUs.
     """
-    if not shares:
+    if not gpu_groups:
         if per_gpu:
-            raise InputError(f"--workers-per-gpu {per_gpu}: there are no GPUs for workers here")
+            raise InputError(f"--workers-per-gpu {per_gpu}: this machine has no GPUs for workers")
         return workers or os.cpu_count() or 1
-    most = len(shares) * (per_gpu or 1)
+    most = len(gpu_groups) * (per_gpu or 1)
     if workers and per_gpu and workers > most:
         raise InputError(f"--workers {workers}: must be at most {most} with --workers-per-gpu {per_gpu}")
     return workers or most
@@ -84,46 +86,46 @@ class Worker:
 
     def __init__(self, process: subprocess.Popen[bytes], folder: Path):
         self.process, self.folder = process, folder
-        threading.Thread(target=process.wait, daemon=True).start()  # so that it leaves no zombie
+        threading.Thread(target=process.wait, daemon=True).start()  # reaps the process
 
     def alive(self) -> bool:
         """Return whether the process is working."""
         return self.process.poll() is None
 
     def cancel(self) -> None:
-        """Ask the process to end; it releases the run that it is working on."""
+        """Terminate the process. It releases its run first."""
         self.process.terminate()
 
     def complaint(self) -> str | None:
-        """Return the worker's own line about why it could do no work; None after any other end."""
+        """Return the line that explains why the worker could not work; None after any other end."""
         path = self.folder / LINE
         return path.read_text(encoding="utf-8") if path.exists() else None
 
 
-class Local:
-    """Starts workers as processes of this machine, each with its share of the GPUs.
+class LocalExecutor:
+    """Starts workers as processes of this machine, each with a GPU group.
 
     Args:
-        folder: the folder of the workers' logs, with %j for a worker's name.
-        shares: the shares of GPUs that workers may have; empty for workers without GPUs.
+        folder: the folder of the workers' logs, with %j in place of a worker's name.
+        gpu_groups: the GPU groups that workers may get; empty for workers without GPUs.
     """
 
-    def __init__(self, folder: Path, shares: Sequence[Share] = ()):
+    def __init__(self, folder: Path, gpu_groups: Sequence[GpuGroup] = ()):
         self.folder = folder
-        self.shares = list(shares) or [()]
-        self.gpus = bool(shares)
+        self.gpu_groups = list(gpu_groups) or [()]
+        self.gpus = bool(gpu_groups)
         self.workers: list[tuple[Worker, int]] = []
 
     def submit(self, work: Work, count: int = 1) -> list[Worker]:
-        """Start workers, each with the share of GPUs that has the fewest living workers."""
+        """Start workers, each with the GPU group that has the fewest living workers."""
         return [self._start(work) for _ in range(count)]
 
     def _start(self, work: Work) -> Worker:
         self.workers = [(worker, number) for worker, number in self.workers if worker.alive()]
         users = [number for _, number in self.workers]
-        least = min(range(len(self.shares)), key=users.count)
+        least = min(range(len(self.gpu_groups)), key=users.count)
         folder = Path(str(self.folder).replace("%j", uuid.uuid4().hex[:12]))
-        process = start_process(work, folder, {VISIBLE: ",".join(self.shares[least])})
+        process = start_process(work, folder, {VISIBLE: ",".join(self.gpu_groups[least])})
         self.workers.append((Worker(process, folder), least))
         return self.workers[-1][0]
 
@@ -134,10 +136,10 @@ def start_process(
     """Start a Python process that does the work, with its output in the folder's `log.txt`.
 
     Args:
-        work: the work; the line that it returns is written to the file LINE.
+        work: the work; a returned line is written to the file LINE.
         folder: a new folder.
-        environment: further variables of the process' environment.
-        with_parent: whether it ends when this process ends.
+        environment: additional environment variables.
+        with_parent: whether the new process ends when this process ends.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / WORK).write_bytes(pickle.dumps(work))
@@ -149,12 +151,12 @@ def start_process(
             stdin=subprocess.PIPE if with_parent else subprocess.DEVNULL,
             stdout=log,
             stderr=log,
-            start_new_session=True,  # Ctrl-C reaches only the controller, which ends its workers
+            start_new_session=True,  # Ctrl-C reaches only the controller, which then ends its workers
         )
 
 
 def do_work(folder: Path) -> None:
-    """Do the work of a worker's folder, in a process of its own."""
+    """Do the work that is pickled in a worker's folder. It is called in the worker's process."""
     collect_garbage_rarely()
     work: Work = pickle.loads((folder / WORK).read_bytes())
     (folder / WORK).unlink()
@@ -165,13 +167,15 @@ def do_work(folder: Path) -> None:
 
 
 def _end_with_parent() -> None:
-    while os.read(sys.stdin.fileno(), 1):  # past Python's buffer, for which the end of the process waits
+    while os.read(
+        sys.stdin.fileno(), 1
+    ):  # not sys.stdin.read, because the process would wait for its buffer at exit
         pass
     os._exit(1)
 
 
 class DebugWorker:
-    """A worker that works inside this process, when it is first asked whether it is alive."""
+    """A worker inside this process. Its work is done during the first call of `alive`."""
 
     def __init__(self, work: Work):
         self.work: Work | None = work
@@ -185,20 +189,20 @@ class DebugWorker:
         return False
 
     def cancel(self) -> None:
-        """Do nothing: the work is done, or never begins."""
+        """Do nothing, because the work is either done or not started."""
 
     def complaint(self) -> str | None:
         """Return the line that the work returned."""
         return self.line
 
 
-class Debug:
+class DebugExecutor:
     """Runs workers inside this process, for debuggers."""
 
     gpus = False
 
     def submit(self, work: Work, count: int = 1) -> list[DebugWorker]:
-        """Make workers that do their work when they are first asked whether they are alive."""
+        """Make workers. Each works during the first call of its `alive`."""
         return [DebugWorker(work) for _ in range(count)]
 
 

@@ -17,12 +17,12 @@ from memmlp.sweep.executors.local import VISIBLE
 
 def _read_runtime_env(path: str) -> Mapping[str, Any]:
     try:
-        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ValueError(describe_read_error(error)) from None
-    if not isinstance(found, dict):
-        raise ValueError("expected a YAML file of Ray's keys, such as env_vars")
-    return found
+    if not isinstance(content, dict):
+        raise ValueError("expected a YAML file with keys of Ray's runtime environment, such as env_vars")
+    return content
 
 
 SETTINGS: Mapping[str, Callable[[str], Any]] = {
@@ -34,9 +34,9 @@ SETTINGS: Mapping[str, Callable[[str], Any]] = {
     "runtime_env": _read_runtime_env,
     "resources.NAME": parse_amount,
 }
-"""The settings `ray.KEY`: the cluster's address, by default that in RAY_ADDRESS, or else a cluster on this
-machine; what each worker requests, where less than 1 GPU is a part of one; and a YAML file of Ray's keys for
-the environment in which workers run."""
+"""The settings `ray.KEY`. `address`: the cluster's address, by default RAY_ADDRESS, else a new local cluster.
+`runtime_env`: a YAML file that describes Ray's runtime environment. The others: the resources of each worker;
+`num_gpus` may be a fraction."""
 
 
 class RayTask:
@@ -46,7 +46,7 @@ class RayTask:
         self.ray, self.reference = ray, reference
 
     def alive(self) -> bool:
-        """Return whether the task is waiting or working; False on a dead node."""
+        """Return whether the task is waiting or working; False if its node is dead."""
         return not self.ray.wait([self.reference], timeout=0)[0]
 
     def cancel(self) -> None:
@@ -54,7 +54,7 @@ class RayTask:
         self.ray.cancel(self.reference, force=True)
 
     def complaint(self) -> str | None:
-        """Return the worker's own line about why it could do no work; None after any other end."""
+        """Return the line that explains why the worker could not work; None after any other end."""
         try:
             return self.ray.get(self.reference)
         except self.ray.exceptions.RayError:
@@ -62,29 +62,29 @@ class RayTask:
 
 
 class Ray:
-    """Starts workers as tasks of a Ray cluster: a running one, or one on this machine.
+    """Starts workers as tasks of a running Ray cluster, or of a new cluster on this machine.
 
     Args:
         options: the parsed SETTINGS.
-        gpus: whether workers get GPUs, if the options do not say so.
+        gpus: whether each worker gets a GPU if the cluster has GPUs; the option `num_gpus` has priority.
 
     Raises:
-        InputError: if Ray is not installed or the cluster can't be reached.
+        InputError: if Ray is not installed or the cluster cannot be reached.
     """
 
     def __init__(self, options: Mapping[str, Any], gpus: bool = True):
         self.ray: Any = import_optional("ray", "ray", "executor=ray")
         if not self.ray.is_initialized():
             self._connect(options)
-        there = self.ray.cluster_resources()
-        least = 1.0 if gpus and there.get("GPU") else 0.0
-        self.num_gpus = options.get("num_gpus", least)
+        resources = self.ray.cluster_resources()
+        default = 1.0 if gpus and resources.get("GPU") else 0.0
+        self.num_gpus = options.get("num_gpus", default)
         num_cpus = options.get("num_cpus", 1.0)
         self.gpus = self.num_gpus > 0
         self.task = {key: options[key] for key in ("accelerator_type", "resources") if key in options}
         if "memory_gb" in options:
             self.task["memory"] = options["memory_gb"] * 2**30
-        # The fleet replaces dead workers; Ray must not run a task again as well.
+        # Ray must not repeat tasks, because the fleet already replaces dead workers.
         self.task |= {"num_cpus": num_cpus, "num_gpus": self.num_gpus, "max_retries": 0, "max_calls": 1}
 
     def _connect(self, options: Mapping[str, Any]) -> None:
@@ -108,5 +108,5 @@ def _work_with_gpus(work: Work) -> str | None:
 
 
 def _work_without_gpus(work: Work) -> str | None:
-    os.environ[VISIBLE] = ""  # Ray may show some to a task that asked for none
+    os.environ[VISIBLE] = ""  # Ray may show GPUs to a task that did not request any
     return work()

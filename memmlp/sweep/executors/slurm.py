@@ -1,4 +1,4 @@
-"""Workers that are jobs of a Slurm cluster, submitted by submitit; an array of those that start together."""
+"""Workers that are jobs of a Slurm cluster, submitted with submitit as job arrays."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from memmlp.common.processes import collect_garbage_rarely, pass_import_paths_to
 from memmlp.sweep.executors import Work
 
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
-OURS = ("array", "output", "error", "open_mode", "signal", "wrap", "wait", "parsable", "test_only")
-ONE = ("nodes", "ntasks", "ntasks_per_node", "ntasks_per_gpu")  # a worker is one task
+RESERVED = ("array", "output", "error", "open_mode", "signal", "wrap", "wait", "parsable", "test_only")
+FIXED_TO_ONE = ("nodes", "ntasks", "ntasks_per_node", "ntasks_per_gpu")  # since a worker is one task
 
 
 @dataclass(frozen=True)
 class SlurmOptions:
-    """The options with which jobs are submitted.
+    """The options of submitted jobs.
 
     Attributes:
-        parameters: sbatch's parameters by their long names, with _ for -; True for one without a value.
+        parameters: sbatch's options by long name, with _ in place of -; True for an option without a value.
         srun: arguments for srun, which starts the worker inside the job.
-        setup: a shell command that each job runs first; None for none.
-        python: the command that starts Python in the job; None for this process' own.
-        minutes: the time limit.
+        setup: a shell command that each job runs first, or None.
+        python: the command that starts Python in the job; None for the Python of this process.
+        minutes: the time limit in minutes.
     """
 
     parameters: Mapping[str, str | bool] = field(default_factory=dict)
@@ -43,17 +43,17 @@ class SlurmOptions:
 
     @property
     def gpu(self) -> bool:
-        """Whether a job asks for GPUs."""
-        wanted = [value for key, value in self.parameters.items() if key in ("gres", "tres_per_task")]
+        """Whether a job requests GPUs."""
+        resources = [value for key, value in self.parameters.items() if key in ("gres", "tres_per_task")]
         counted = any(key.startswith("gpus") for key in self.parameters)
-        return counted or any("gpu" in str(value) for value in wanted)
+        return counted or any("gpu" in str(value) for value in resources)
 
 
-def slurm_options(settings: Mapping[str, str]) -> SlurmOptions:
-    """Return the options that `slurm.KEY=VALUE` on a command line set.
+def parse_slurm_options(settings: Mapping[str, str]) -> SlurmOptions:
+    """Return the options for settings `slurm.KEY=VALUE`.
 
     Raises:
-        InputError: for a value of the wrong kind, and for options that memmlp sets itself.
+        InputError: for an invalid value, and for an option that memmlp sets itself.
     """
     known = {key.replace("-", "_"): value for key, value in settings.items()}
     setup, python = known.pop("setup", None), known.pop("python", None)
@@ -62,75 +62,77 @@ def slurm_options(settings: Mapping[str, str]) -> SlurmOptions:
     srun += [f"--{key.replace('_', '-')}={known.pop(key)}" for key in containers]
     parameters: dict[str, str | bool] = {}
     for key, value in known.items():
-        parameters |= _parameter(key, value)
+        parameters |= _parse_parameter(key, value)
     if "time" not in known:
-        raise InputError("slurm.time: has no value; give the time limit of a job with slurm.time=H:MM:SS")
-    return SlurmOptions(parameters, tuple(srun), setup, python, _minutes(known["time"]))
+        raise InputError("slurm.time: has no value; set the time limit of a job with slurm.time=H:MM:SS")
+    return SlurmOptions(parameters, tuple(srun), setup, python, _parse_minutes(known["time"]))
 
 
-def _parameter(key: str, value: str) -> dict[str, str | bool]:
-    if key in OURS:
-        raise InputError(f"slurm.{key}: is set by memmlp; expected another option of sbatch")
-    if key in ONE:
-        raise InputError(f"slurm.{key}: cannot be set, since a worker is one task on one node (--workers)")
+def _parse_parameter(key: str, value: str) -> dict[str, str | bool]:
+    if key in RESERVED:
+        raise InputError(f"slurm.{key}: is set by memmlp; expected another sbatch option")
+    if key in FIXED_TO_ONE:
+        raise InputError(
+            f"slurm.{key}: cannot be set, because a worker is one task on one node; use --workers N"
+        )
     if not re.fullmatch(r"[a-z][a-z0-9_]*", key) or not value or not value.isprintable():
-        raise InputError(f"slurm.{key}={value}: expected the long name of an option of sbatch, and a value")
+        raise InputError(f"slurm.{key}={value}: expected the long name of an sbatch option, and a value")
     if key == "mem_gb":
-        return {"mem": f"{_number(key, value)}GB"}
+        return {"mem": f"{_parse_number(key, value)}GB"}
     if key == "cpus":
-        return {"cpus_per_task": str(_number(key, value))}
+        return {"cpus_per_task": str(_parse_number(key, value))}
     if key == "gpus":
-        return {"gpus_per_node": value if ":" in value else str(_number(key, value))}
+        return {"gpus_per_node": value if ":" in value else str(_parse_number(key, value))}
     return {} if value == "false" else {key: value == "true" or value}
 
 
-def _number(key: str, value: str) -> int:
+def _parse_number(key: str, value: str) -> int:
     if not value.isdecimal() or int(value) == 0:
         raise InputError(f"slurm.{key}={value}: must be a whole number above 0")
     return int(value)
 
 
-def _minutes(text: str) -> int:
-    """Return a time in minutes, rounded up, from Slurm's forms M, M:S, H:M:S, D-H, D-H:M or D-H:M:S."""
-    found = TIME.fullmatch(text)
-    if not found:
+def _parse_minutes(text: str) -> int:
+    """Return the minutes, rounded up, of a Slurm time M, M:S, H:M:S, D-H, D-H:M or D-H:M:S."""
+    match = TIME.fullmatch(text)
+    if not match:
         raise InputError(f"slurm.time={text}: expected MINUTES, H:MM:SS, D-HH or D-HH:MM")
-    days, *parts = (int(part) if part else 0 for part in found.group("days", "first", "second", "third"))
-    if not found["days"] and not found["third"]:
+    days, *parts = (int(part) if part else 0 for part in match.group("days", "first", "second", "third"))
+    if not match["days"] and not match["third"]:
         parts = [0, *parts[:2]]  # without hours
     hours, minutes, seconds = parts
     return (days * 24 + hours) * 60 + minutes + (seconds > 0)
 
 
-class Requeued:
-    """Work that a preempted job does again; its runs continue from their checkpoints."""
+class RequeuedWork:
+    """Work that is queued again if its job is preempted. Runs continue from their checkpoints."""
 
     def __init__(self, work: Work):
         self.work = work
 
     def __call__(self) -> str | None:
-        """Do the work, in the process that submitit started for it."""
+        """Do the work. submitit calls this in the job's process."""
         collect_garbage_rarely()
         return self.work()
 
     def checkpoint(self) -> Any:
-        """Return the submission that submitit queues when the job is preempted or its time is up."""
+        """Return a new submission of the work. submitit queues it when the job is preempted or times out."""
         return submitit.helpers.DelayedSubmission(self)
 
 
 class SubmititSlurm(submitit.SlurmExecutor):
     """Submitit's executor with memmlp's options."""
 
-    def set(self, options: SlurmOptions) -> None:
-        """Set the options with which jobs are submitted."""
+    def set_options(self, options: SlurmOptions) -> None:
+        """Set the options of later submissions."""
         given = {"additional_parameters": dict(options.parameters), "srun_args": list(options.srun)}
         setup = {"setup": [options.setup]} if options.setup else {}
-        # Submitit would set a wckey of its own, which clusters without such keys refuse.
+        # submitit's default wckey is rejected by clusters without wckeys.
         self.update_parameters(job_name="memmlp", time=options.minutes, wckey=None, **given, **setup)
 
 
-class Unsent(SubmititSlurm):
-    """An executor that only writes the submission file; Slurm need not be installed."""
+class UnsentSlurm(SubmititSlurm):
+    """An executor that only makes the submission file, also on machines without Slurm."""
 
     @classmethod
     def affinity(cls) -> int:
@@ -153,7 +155,7 @@ class Job:
         self.job.cancel(check=False)
 
     def complaint(self) -> str | None:
-        """Return the worker's own line about why it could do no work; None after any other end."""
+        """Return the line that explains why the worker could not work; None after any other end."""
         if not self.job.paths.result_pickle.exists() or self.job.exception() is not None:
             return None
         return self.job.result()
@@ -163,39 +165,39 @@ class Slurm:
     """Starts workers as jobs of the Slurm cluster of this machine.
 
     Args:
-        folder: the folder of the workers' logs, with %j for a job's number.
-        options: the options with which jobs are submitted.
+        folder: the folder of the workers' logs, with %j in place of a job's number.
+        options: the options of the jobs.
 
     Raises:
         InputError: if Slurm is not installed.
     """
 
     def __init__(self, folder: Path, options: SlurmOptions):
-        with _one_line_errors():
+        with _convert_errors():
             self.executor = SubmititSlurm(folder=folder, python=options.python)
-            self.executor.set(options)
+            self.executor.set_options(options)
         self.imports = pass_import_paths_to_children if options.python is None else contextlib.nullcontext
         self.gpus = options.gpu
 
     def submit(self, work: Work, count: int = 1) -> list[Job]:
-        """Start workers as one job array. Raises InputError if sbatch refuses an option."""
-        with _one_line_errors():
+        """Start workers as a job array. Raises InputError if sbatch rejects an option."""
+        with _convert_errors():
             with self.imports(), self.executor.batch():
-                jobs: list[Any] = [self.executor.submit(Requeued(work)) for _ in range(count)]
+                jobs: list[Any] = [self.executor.submit(RequeuedWork(work)) for _ in range(count)]
             return [Job(job) for job in jobs]
 
 
-def batch_script(folder: Path, options: SlurmOptions, workers: int) -> str:
-    """Return the file that sbatch would get for the given number of workers; Slurm need not be installed."""
-    executor = Unsent(folder=folder, python=options.python)
-    executor.set(options)
+def format_batch_script(folder: Path, options: SlurmOptions, workers: int) -> str:
+    """Return the text of the sbatch script for this number of workers, also on machines without Slurm."""
+    executor = UnsentSlurm(folder=folder, python=options.python)
+    executor.set_options(options)
     if workers > 1:
         executor.parameters["map_count"] = workers
     return executor._make_submission_file_text(executor._submitit_command_str, "worker")
 
 
 @contextlib.contextmanager
-def _one_line_errors() -> Iterator[None]:
+def _convert_errors() -> Iterator[None]:
     logging.getLogger("submitit").setLevel(logging.ERROR)
     try:
         yield

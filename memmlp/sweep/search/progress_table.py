@@ -1,4 +1,4 @@
-"""The live table of a search: what runs, the best trials so far, and how many trials ended in each way."""
+"""The live table of a search: the running trials, the best trials, and the number of trials in each state."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rich.table import Table
 from rich.text import Text
 
 from memmlp.runs.run import Run
-from memmlp.sweep.progress_table import Screen, progress_text, titled_table
+from memmlp.sweep.progress_table import Screen, describe_progress, make_titled_table
 from memmlp.sweep.search.search_file import Search, Value
-from memmlp.sweep.search.study import Study, deviations, reason
+from memmlp.sweep.search.study import Study, compute_deviations, get_reason
 
-SHOWN = 5  # how many of the best trials are shown
+MAX_BEST = 5  # the maximum number of best trials shown
 ENDS = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
 
@@ -33,58 +33,58 @@ class SearchBoard(Screen):
         self.printed: set[int] | None = None
 
     def update(self, study: Study) -> None:
-        """Show the study, and the runs of its trials, in their present state."""
+        """Show the current state of the study and its trials' runs."""
         ended = [trial for trial in study.trials if trial.state in ENDS]
         numbers = {trial.number for trial in ended}
         printed = numbers if self.printed is None else self.printed
         changes = [describe_end(one) for one in ended if one.number not in printed]
 
-        def progress() -> list[str]:
+        def describe_running() -> list[str]:
             return [
                 f"trial {trial.number}: {_describe_runs(trial, runs)}"
-                for trial, runs in running_trials(study, self.outputs)
+                for trial, runs in list_running_trials(study, self.outputs)
                 if any(run.activity for run in runs)
             ]
 
         count = f"{len(ended)} of {study.search.n_trials}"
-        self.show(lambda: render(study, self.outputs), count, changes, progress)
+        self.show(lambda: render(study, self.outputs), count, changes, describe_running)
         self.printed = numbers
 
 
 def describe_end(trial: FrozenTrial) -> str:
-    """Describe how a trial ended."""
-    result = figures(trial) if trial.state == TrialState.COMPLETE else reason(trial)
+    """Return a line about a trial's result, or the reason of its end, with its values."""
+    result = format_objectives(trial) if trial.state == TrialState.COMPLETE else get_reason(trial)
     params = ", ".join(f"{key}={_short_value(value)}" for key, value in trial.params.items())
     return f"trial {trial.number} {ENDS[trial.state]}: {result} ({params})"
 
 
-def runs_of(trial: FrozenTrial, outputs: Path) -> list[Run]:
-    """Return the runs that a trial has needed so far."""
+def list_runs(trial: FrozenTrial, outputs: Path) -> list[Run]:
+    """Return the runs that were requested for a trial."""
     return [Run.from_id(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
 
 
-def running_trials(study: Study, outputs: Path) -> list[tuple[FrozenTrial, list[Run]]]:
-    """Return the trials that have not ended, each with its runs."""
-    return [(trial, runs_of(trial, outputs)) for trial in study.trials if trial.state not in ENDS]
+def list_running_trials(study: Study, outputs: Path) -> list[tuple[FrozenTrial, list[Run]]]:
+    """Return each running trial with its runs."""
+    return [(trial, list_runs(trial, outputs)) for trial in study.trials if trial.state not in ENDS]
 
 
-def figures(trial: FrozenTrial) -> str:
+def format_objectives(trial: FrozenTrial) -> str:
     """Return a trial's objective values as text, with standard deviations if it has several seeds."""
     shown = [f"{value:.3f}" for value in trial.values or []]
-    if spread := deviations(trial):
+    if spread := compute_deviations(trial):
         shown = [f"{value} ± {sd:.3f}" for value, sd in zip(shown, spread, strict=True)]
     return ", ".join(shown)
 
 
 def render(study: Study, outputs: Path) -> Group:
-    """Draw the running trials, the best ones, and the counts."""
-    table = trials_table(study.search, f"search {study.search.name}")
-    for trial, runs in running_trials(study, outputs):
+    """Return the table of the running and the best trials, with the counts below it."""
+    table = make_trials_table(study.search, f"search {study.search.name}")
+    for trial, runs in list_running_trials(study, outputs):
         add_row(table, study.search, trial, _describe_runs(trial, runs))
     ranked = sorted((t for t in study.trials if t.state == TrialState.COMPLETE), key=lambda t: t.values)
-    for trial in ranked[:SHOWN]:
-        add_row(table, study.search, trial, Text(figures(trial), style="green"))
-    return Group(table, Text(count_trials(study)))
+    for trial in ranked[:MAX_BEST]:
+        add_row(table, study.search, trial, Text(format_objectives(trial), style="green"))
+    return Group(table, Text(describe_counts(study)))
 
 
 def _describe_runs(trial: FrozenTrial, runs: Sequence[Run]) -> Text:
@@ -93,21 +93,21 @@ def _describe_runs(trial: FrozenTrial, runs: Sequence[Run]) -> Text:
     done = f"{count} seeds done, " if count else ""
     if current is None:
         return Text(f"{done}waiting")
-    return Text(done + progress_text(current, trial.user_attrs["steps"]), style="cyan")
+    return Text(done + describe_progress(current, trial.user_attrs["steps"]), style="cyan")
 
 
-def trials_table(search: Search, title: str) -> Table:
+def make_trials_table(search: Search, title: str) -> Table:
     """Make an empty table of trials, with a column for each searched key."""
-    table = titled_table(title)
+    table = make_titled_table(title)
     table.add_column("trial", justify="right")
     table.add_column(", ".join(objective.text for objective in search.objectives))
-    for name in shorten(one.key for one in search.space):
+    for name in shorten_keys(one.key for one in search.space):
         table.add_column(name, justify="right")
     return table
 
 
-def shorten(keys: Iterable[str]) -> list[str]:
-    """Return the keys without their group, if all of them have the same group."""
+def shorten_keys(keys: Iterable[str]) -> list[str]:
+    """Remove the group from the keys if all of them have the same group."""
     every = list(keys)
     groups = {key.rpartition(".")[0] for key in every}
     return [key.rpartition(".")[2] for key in every] if len(groups) == 1 else every
@@ -123,8 +123,8 @@ def _short_value(value: Value) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def count_trials(study: Study) -> str:
-    """Say how many trials are in each state, and how many are wanted."""
+def describe_counts(study: Study) -> str:
+    """Return a line with the number of trials in each state and the search's number of trials."""
     counts = Counter(ENDS.get(trial.state, "running") for trial in study.trials)
-    listed = ", ".join(f"{count} {state}" for state, count in counts.items())
-    return f"{len(study.trials)} of {study.search.n_trials} trials: {listed or 'none yet'}"
+    states = ", ".join(f"{count} {state}" for state, count in counts.items())
+    return f"{len(study.trials)} of {study.search.n_trials} trials: {states or 'none yet'}"

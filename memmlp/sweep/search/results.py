@@ -1,4 +1,4 @@
-"""The results of a search: its trials as CSV, the best as experiments, and plots."""
+"""The results of a search: a CSV file of its trials, config files of the best trials, and plots."""
 
 from __future__ import annotations
 
@@ -21,23 +21,22 @@ from optuna.trial import FrozenTrial, TrialState
 from memmlp.common.errors import import_optional
 from memmlp.common.files import atomic_write
 from memmlp.common.overrides import select_last_by_key
-from memmlp.sweep.search.study import Study, deviations, reason, trial_values
+from memmlp.sweep.search.study import Study, compute_deviations, get_reason, get_values
 
-IMPORTANCE = "by which keys the best tenth of the trials differs"
+IMPORTANCE = "keys in which the best tenth of the trials differs from the others"
 ENOUGH_TRIALS = 25
-"""From so many complete trials on a tenth of them is more than two, and importance more than chance.
+"""The minimum number of complete trials for an estimate of importance.
 
-Of three keys, one of which acts, it ranks that one first in 95 % of random searches of 25 trials, in 78 % of
-those of 20, in 45 % of those of 10.
+In random searches over three keys, only one of them with an effect, that key was ranked first in 95 % of
+searches with 25 trials, in 78 % with 20 trials and in 45 % with 10 trials.
 """
 
 
 def write_trials(study: Study, path: Path) -> None:
     """Write all trials to a CSV file: number, state, objectives, values, runs, and the reason of a failure.
 
-    With several seeds the objectives are means, followed by each objective's standard deviation and by the
-    values of the single seeds. A pruned trial has no value: the value of an
-    earlier step is not a result, and stands in the reason.
+    With several seeds, the objectives are means. Columns with the standard deviations and each seed's values
+    follow. A pruned trial has empty objectives; the reason contains its last value.
     """
     search = study.search
     names, keys = [one.text for one in search.objectives], [one.key for one in search.space]
@@ -51,48 +50,48 @@ def write_trials(study: Study, path: Path) -> None:
         figures = trial.values if trial.state == TrialState.COMPLETE else [""] * len(names)
         by_seed: list[Any] = []
         if seeds:
-            by_seed = [*deviations(trial), *itertools.chain(*trial.user_attrs.get("values", ()))]
+            by_seed = [*compute_deviations(trial), *itertools.chain(*trial.user_attrs.get("values", ()))]
             by_seed = by_seed or [""] * len(seed_columns)
         params = [trial.params.get(key, "") for key in keys]
-        extra = [" ".join(trial.user_attrs.get("runs", ())), reason(trial)]
+        extra = [" ".join(trial.user_attrs.get("runs", ())), get_reason(trial)]
         writer.writerow([trial.number, trial.state.name.lower(), *figures, *by_seed, *params, *extra])
     atomic_write(path, text.getvalue())
 
 
 def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
-    """Write the best trial to experiment/best.yaml, and the others of a Pareto front to trial-N.yaml.
+    """Write the best trial to experiment/best.yaml, and the rest of a Pareto front to trial-N.yaml.
 
-    Files of trials that left the front are removed.
+    Files of trials that are no longer on the front are removed.
 
     Args:
         study: the study.
         folder: the search's folder.
-        groups: the names of the config groups, whose values are options rather than numbers.
+        groups: the names of the config groups; a trial chooses options of them.
 
     Returns:
-        The files, the best trial's first.
+        The paths of the files, with the best trial's file first.
     """
     folder = folder / "experiment"
     folder.mkdir(parents=True, exist_ok=True)
-    best = study.best()
+    best = study.list_best()
     files = [folder / ("best.yaml" if not n else f"trial-{one.number}.yaml") for n, one in enumerate(best)]
     for path, trial in zip(files, best, strict=True):
-        atomic_write(path, experiment(study, trial, groups))
+        atomic_write(path, format_experiment(study, trial, groups))
     for stale in {*folder.glob("trial-[0-9]*.yaml")} - {*files}:
         stale.unlink()
     return files
 
 
-def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
+def format_experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
     """Return a trial as the text of a file for the config group `experiment`.
 
-    It lacks an experiment of the search's base, since an experiment cannot choose another one, and it does
-    not override an experiment of a command line.
+    The text omits an `experiment=` override of the search's base, because an experiment cannot select another
+    experiment.
     """
     search = study.search
     tree: dict[str, Any] = {}
     options: list[dict[str, str]] = []
-    texts = (*search.base, *search.overrides(trial_values(trial, search)))
+    texts = (*search.base, *search.overrides(get_values(trial, search)))
     for key, override in select_last_by_key(texts).items():
         if key == "experiment":
             continue
@@ -112,65 +111,70 @@ def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str
     return head + yaml.safe_dump({"defaults": [*options, "_self_"], **tree}, sort_keys=False)
 
 
-def importances(study: optuna.Study) -> list[tuple[str, float]]:
-    """Return each key's importance for the first objective of an Optuna study, largest first; their sum is 1.
+def compute_importances(study: optuna.Study) -> list[tuple[str, float]]:
+    """Return each key's importance for an Optuna study's first objective, largest first. The sum is 1.
 
-    It shows by which keys the best tenth of the trials differs from all of them (PED-ANOVA, Watanabe et
-    al. 2023); it is not a share of the variation. The list is empty with fewer than ENOUGH_TRIALS complete
-    trials or a single key.
+    PED-ANOVA (Watanabe et al. 2023) measures in which keys the best tenth of the trials differs from all
+    trials. It does not measure explained variance. The list is empty with fewer than ENOUGH_TRIALS complete
+    trials or with a single key.
     """
-    complete = _complete(study)
+    complete = _list_complete_trials(study)
     if len(complete) < ENOUGH_TRIALS or len(complete[0].params) < 2:
         return []
-    target = None if len(study.directions) == 1 else _first
+    target = None if len(study.directions) == 1 else _get_first_objective
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = optuna.importance.get_param_importances(study, evaluator=_evaluator(), target=target)
+        found = optuna.importance.get_param_importances(study, evaluator=_make_evaluator(), target=target)
     return sorted(found.items(), key=lambda item: -item[1])
 
 
-def too_few_trials(study: optuna.Study) -> str | None:
-    """Return why an Optuna study of several keys has no importances yet; None if it has, or has no trial."""
-    complete = _complete(study)
+def explain_missing_importances(study: optuna.Study) -> str | None:
+    """Return a line if a study has too few trials for importances.
+
+    Return None if it has enough trials, no complete trial, or a single key.
+    """
+    complete = _list_complete_trials(study)
     if not 0 < len(complete) < ENOUGH_TRIALS or len(complete[0].params) < 2:
         return None
     return f"needs {ENOUGH_TRIALS} complete trials; with {len(complete)} it would be chance"
 
 
-def _complete(study: optuna.Study) -> list[FrozenTrial]:
+def _list_complete_trials(study: optuna.Study) -> list[FrozenTrial]:
     return [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.COMPLETE]
 
 
-def _evaluator() -> PedAnovaImportanceEvaluator:
+def _make_evaluator() -> PedAnovaImportanceEvaluator:
     with warnings.catch_warnings():  # Optuna's other evaluators need scikit-learn
         warnings.simplefilter("ignore", ExperimentalWarning)
         return PedAnovaImportanceEvaluator()
 
 
-def _first(trial: FrozenTrial) -> float:
+def _get_first_objective(trial: FrozenTrial) -> float:
     return trial.values[0]
 
 
-def boundary_warnings(study: optuna.Study) -> list[str]:
-    """Return a warning for each key with its best value at an end of its range: better ones may lie beyond.
+def find_boundary_warnings(study: optuna.Study) -> list[str]:
+    """Return a warning for each key with its best value at an end of the searched range.
 
-    A value within a fiftieth of the range's width is at its end (of the logarithm's width, if that is
-    searched). There are no warnings for several objectives, whose front reaches the ends, and none at zero,
-    beyond which nothing lies.
+    The end is the outer 2 % of the range, on a logarithmic scale if the search uses one. There are no
+    warnings for several objectives, because a Pareto front often reaches the ends, or for a value of zero.
     """
-    if len(_complete(study)) < 2 or len(study.directions) > 1:
+    if len(_list_complete_trials(study)) < 2 or len(study.directions) > 1:
         return []
     best = study.best_trial
-    ends = ((key, best.params[key], _end(best.params[key], one)) for key, one in best.distributions.items())
+    ends = (
+        (key, best.params[key], _find_range_end(best.params[key], one))
+        for key, one in best.distributions.items()
+    )
     return [
-        f"{key}: the best value, {value:g}, is the {end} that was tried; better ones may lie beyond it"
+        f"{key}: the best value, {value:g}, is the {end} tried value; consider a wider range"
         for key, value, end in ends
         if end
     ]
 
 
-def _end(value: Any, tried: BaseDistribution) -> str | None:
-    """Return the end at which a value is among those searched, "smallest" or "largest"; None for neither."""
+def _find_range_end(value: Any, tried: BaseDistribution) -> str | None:
+    """Return "smallest" or "largest" if a value is at this end of the tried values, else None."""
     if isinstance(tried, CategoricalDistribution):
         numbers = [one for one in tried.choices if isinstance(one, int | float) and not isinstance(one, bool)]
         if len(numbers) < len(tried.choices):
@@ -182,37 +186,37 @@ def _end(value: Any, tried: BaseDistribution) -> str | None:
     if low == high:
         return None
     scale = math.log if getattr(tried, "log", False) else float
-    share = (scale(value) - scale(low)) / (scale(high) - scale(low))
-    if share >= 1 - margin:
+    position = (scale(value) - scale(low)) / (scale(high) - scale(low))
+    if position >= 1 - margin:
         return "largest"
-    return "smallest" if share <= margin and value else None
+    return "smallest" if position <= margin and value else None
 
 
-def plots(study: Study) -> dict[str, dict[str, Any]]:
-    """Return the plots that are possible for a study, by name, with their further arguments."""
+def list_plots(study: Study) -> dict[str, dict[str, Any]]:
+    """Return the possible plots of a study: the keyword arguments for Optuna by the plot's name."""
     names = [objective.text for objective in study.search.objectives]
-    if len(_complete(study.study)) < 2:
+    if len(_list_complete_trials(study.study)) < 2:
         return {}
     if len(names) == 2:
-        first = {"target": _first, "target_name": names[0]}
+        first = {"target": _get_first_objective, "target_name": names[0]}
         return {"pareto_front": {"target_names": names}, "parallel_coordinate": first, "slice": first}
     titled = {"target_name": names[0]}
     found: dict[str, dict[str, Any]] = dict.fromkeys(
         ("optimization_history", "parallel_coordinate", "slice"), titled
     )
-    if importances(study.study):
-        found["param_importances"] = {**titled, "evaluator": _evaluator()}
+    if compute_importances(study.study):
+        found["param_importances"] = {**titled, "evaluator": _make_evaluator()}
     return found
 
 
 def write_plots(study: Study, path: Path) -> None:
-    """Write the plots into one HTML page, which works offline; nothing for fewer than two trials."""
+    """Write the plots into an offline HTML page. With fewer than two complete trials, nothing is written."""
     import_optional("plotly", "plots", "the page of a search")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         figures = [
             getattr(optuna.visualization, f"plot_{name}")(study.study, **keywords)
-            for name, keywords in plots(study).items()
+            for name, keywords in list_plots(study).items()
         ]
     parts = [figure.to_html(full_html=False, include_plotlyjs=not n) for n, figure in enumerate(figures)]
     title = f"search {study.search.name}: {len(study.trials)} trials"

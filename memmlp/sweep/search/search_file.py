@@ -1,4 +1,4 @@
-"""The file of a search: config keys with their ranges, objectives on validation, how many trials.
+"""Search files: the ranges of config keys, the objectives, the number of trials, and the sampler.
 
 name: loss_weights
 base: [loss=manual]                 # overrides of every trial
@@ -8,15 +8,15 @@ space:                              # a tree of config keys; its leaves are rang
   optim:
     batch: {low: 16, high: 64, step: 16}
   hand: {choices: ['off', fk]}
-objectives: [MPJPE]                 # on validation, to be lowered; [MPJPE, Jitter] gives a Pareto front
-n_trials: 30                        # in all, however often the search is started
-seeds: 1                            # runs of each trial; its value is their mean; the first can be pruned
-sampler: tpe                        # or random; or grid: each combination of choices once
-startup: 10                         # random trials (after the first) before TPE learns; null without TPE
-seed: 0                             # of the sampler
-pruner: median                      # stops a trial that is worse than the median of the others; or none
-prune_after: 5                      # so many trials are finished before one is stopped; null for no pruner
-storage: null                       # null: a journal in the search's folder; or a storage URL of Optuna's
+objectives: [MPJPE]                 # validation metrics to minimise; [MPJPE, Jitter] gives a Pareto front
+n_trials: 30                        # the total number of trials, also if the search is restarted
+seeds: 1                            # the number of runs per trial; the objective is their mean
+sampler: tpe                        # tpe; random; grid: each combination of choices once
+startup: 10                         # the number of random trials before TPE; null for other samplers
+seed: 0                             # the sampler's seed
+pruner: median                      # median: stops a trial worse than the median of earlier trials; none
+prune_after: 5                      # the number of finished trials before pruning; null with pruner: none
+storage: null                       # null: a journal in the search's folder; or a storage URL for Optuna
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class Range:
     Attributes:
         key: the dotted key.
         low, high: the limits, inclusive; if both are whole numbers, only whole numbers are tried.
-        log: whether values are uniform in their logarithm.
-        step: the step of a grid that starts at `low`; None for no grid.
-        choices: a list of values in place of a range; empty for a range.
-        first: the value in the first trial; None to leave it to the sampler.
+        log: whether the logarithm of the values is sampled uniformly.
+        step: the step of a grid that starts at `low`; None without a grid.
+        choices: the possible values, instead of low and high; empty for a range.
+        first: the value in the first trial; None if the sampler chooses it.
     """
 
     key: str
@@ -61,22 +61,22 @@ class Range:
     first: Value | None = None
 
     def allows(self, value: Any) -> bool:
-        """Return whether a value lies within the range or is one of the choices."""
+        """Return whether a value is within the range, or is one of the choices."""
         if self.choices:
             return value in self.choices
         return isinstance(value, int | float) and self.low <= value <= self.high
 
-    def corners(self) -> tuple[Value, ...]:
-        """Return the values at both ends, or all choices."""
+    def list_corners(self) -> tuple[Value, ...]:
+        """Return all choices, or both limits of the range."""
         return self.choices or (self.low, self.high)
 
 
 @dataclass(frozen=True)
 class Objective:
-    """A weighted sum of validation metrics, which is to be minimised.
+    """A weighted sum of validation metrics, which the search minimises.
 
     Attributes:
-        text: the objective as it was written.
+        text: the objective's text in the search file.
         terms: pairs of a weight and a metric's name in the metrics log ("rotation MPJPE").
     """
 
@@ -84,7 +84,7 @@ class Objective:
     terms: tuple[tuple[float, str], ...]
 
     def value(self, metrics: Mapping[str, float]) -> float:
-        """Return the objective's value for a validation's metrics. Raises InputError if one is missing."""
+        """Return the objective's value for a validation's metrics. Raises InputError for a missing metric."""
         for _, name in self.terms:
             if name not in metrics:
                 known = ", ".join(metrics)
@@ -109,10 +109,10 @@ class Search:
     prune_after: int | None
     storage: str | None
 
-    def first_trials(self) -> list[dict[str, Value]]:
-        """Return the values by key that the first trials get; the sampler chooses those of the other trials.
+    def list_first_trials(self) -> list[dict[str, Value]]:
+        """Return the prescribed trials' values by key; the sampler chooses the values of all other trials.
 
-        They are the values in `first`, or for a grid all combinations, in order.
+        These are a trial with the values in `first`, or all combinations of a grid.
         """
         if self.sampler == "grid":
             keys = [one.key for one in self.space]
@@ -126,41 +126,41 @@ class Search:
         return tuple(f"{key}={format_value(value)}" for key, value in values.items())
 
 
-def _whole(least: int) -> Rule:
+def _make_whole_number_rule(least: int) -> Rule:
     def allows(value: Any) -> bool:
         return isinstance(value, int) and not isinstance(value, bool) and value >= least
 
     return Rule(f"a whole number of at least {least}", allows)
 
 
-def _texts(value: Any) -> bool:
+def _is_text_list(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(item, str) for item in value)
 
 
 RULES = {
     "name": matching(r"[\w-]{1,64}", "up to 64 letters, digits, - and _"),
     "storage": Rule("a URL, or null", lambda value: value is None or isinstance(value, str)),
-    "objectives": Rule("a list of texts", _texts),
-    "base": Rule("a list of texts", _texts),
-    "n_trials": _whole(1),
-    "seeds": _whole(1),
+    "objectives": Rule("a list of texts", _is_text_list),
+    "base": Rule("a list of texts", _is_text_list),
+    "n_trials": _make_whole_number_rule(1),
+    "seeds": _make_whole_number_rule(1),
     "sampler": one_of("tpe", "random", "grid"),
-    "startup": _whole(1),
-    "seed": _whole(0),
+    "startup": _make_whole_number_rule(1),
+    "seed": _make_whole_number_rule(0),
     "pruner": one_of("median", "none"),
-    "prune_after": _whole(1),
+    "prune_after": _make_whole_number_rule(1),
 }
 
 
 def parse_search(content: Mapping[str, Any]) -> Search:
-    """Return the search that a config describes. Raises InputError, which names the key, if it is wrong."""
+    """Return the search that a config describes. Raises InputError for invalid content."""
     keys = [one.name for one in fields(Search)]
     for key in content:
         if key not in keys:
             raise InputError(f"search.{key}: no such key; expected one of {', '.join(keys)}")
     for key in keys:
         if key not in content:
-            raise InputError(f"search.{key}: has no value; give one with search.{key}=...")
+            raise InputError(f"search.{key}: has no value; set search.{key}=VALUE")
     values = {**content, "name": str(content["name"])}
     optional = {"startup": values["sampler"] != "tpe", "prune_after": values["pruner"] == "none"}
     for key, rule in RULES.items():
@@ -168,16 +168,18 @@ def parse_search(content: Mapping[str, Any]) -> Search:
         if not allowed:
             raise InputError(f"search.{key}={values[key]}: must be {rule.words}")
     values["base"] = tuple(values["base"])
-    values["space"] = space = tuple(_ranges(values["space"], ""))
-    values["objectives"] = objectives = tuple(map(_objective, values["objectives"]))
+    values["space"] = space = tuple(_parse_ranges(values["space"], ""))
+    values["objectives"] = objectives = tuple(map(_parse_objective, values["objectives"]))
     if not space:
         raise InputError("search.space: empty; expected config keys with low and high, or with choices")
     if len(objectives) not in (1, 2) or len({one.text for one in objectives}) < len(objectives):
-        raise InputError("search.objectives: expected one, or two different ones for a Pareto front")
+        raise InputError(
+            "search.objectives: expected one objective, or two different objectives for a Pareto front"
+        )
     if len(objectives) > 1 and values["pruner"] != "none":
         raise InputError(f"search.pruner={values['pruner']}: must be none with two objectives")
     if values["seeds"] != 1 and any(one.key == "seed" for one in space):
-        raise InputError(f"search.seeds={values['seeds']}: must be 1 if the space has the seed")
+        raise InputError(f"search.seeds={values['seeds']}: must be 1 if search.space contains seed")
     if values["sampler"] == "grid":
         _check_grid(space, values["n_trials"])
     return Search(**values)
@@ -186,14 +188,17 @@ def parse_search(content: Mapping[str, Any]) -> Search:
 def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
     for one in space:
         if not one.choices or one.first is not None:
-            raise InputError(f"search.space.{one.key}: must have choices alone with search.sampler=grid")
+            raise InputError(f"search.space.{one.key}: must have only choices with search.sampler=grid")
     combinations = math.prod(len(one.choices) for one in space)
     if n_trials != combinations:
-        raise InputError(f"search.n_trials={n_trials}: must be {combinations}, all, with search.sampler=grid")
+        raise InputError(
+            f"search.n_trials={n_trials}: must be {combinations}, the number of combinations, with "
+            "search.sampler=grid"
+        )
 
 
-def _ranges(node: Any, prefix: str) -> Iterator[Range]:
-    """Yield the ranges of a tree of keys; keys that are null are left out."""
+def _parse_ranges(node: Any, prefix: str) -> Iterator[Range]:
+    """Yield the ranges in a tree of keys, without keys that are null."""
     if node is None:
         return
     where = f"search.space{'.' if prefix else ''}{prefix}"
@@ -201,75 +206,79 @@ def _ranges(node: Any, prefix: str) -> Iterator[Range]:
         raise InputError(f"{where}: {node!r}; expected a mapping with low and high, or with choices")
     if not set(node) & set(RANGE_KEYS):
         for key, child in node.items():
-            yield from _ranges(child, f"{prefix}.{key}" if prefix else str(key))
+            yield from _parse_ranges(child, f"{prefix}.{key}" if prefix else str(key))
         return
     for key in node:
         if key not in RANGE_KEYS:
             raise InputError(f"{where}.{key}: no such key; expected one of {', '.join(RANGE_KEYS)}")
-    found = _choices(prefix, node, where) if "choices" in node else _interval(prefix, node, where)
+    found = _parse_choices(prefix, node, where) if "choices" in node else _parse_interval(prefix, node, where)
     if found.first is not None and not found.allows(found.first):
-        raise InputError(f"{where}.first={found.first}: must be a value of the range")
+        raise InputError(f"{where}.first={found.first}: must be within the range")
     yield found
 
 
-def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
+def _parse_choices(key: str, node: Mapping[str, Any], where: str) -> Range:
     choices = node["choices"]
     if isinstance(choices, list):
         choices = [format_value(one) if isinstance(one, list) else one for one in choices]
     plain = isinstance(choices, Sequence) and all(isinstance(one, int | float | str) for one in choices)
     if isinstance(choices, str) or not plain or len(set(choices)) < max(len(choices), 2):
-        raise InputError(f"{where}.choices: expected a list of at least two values, each once")
+        raise InputError(f"{where}.choices: expected a list of at least two different values")
     for other in set(node) - {"choices", "first"}:
-        raise InputError(f"{where}.{other}: does not go with choices")
+        raise InputError(f"{where}.{other}: cannot be combined with choices")
     return Range(key, choices=tuple(choices), first=node.get("first"))
 
 
-def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
-    low, high = (_number(node.get(end), f"{where}.{end}") for end in ("low", "high"))
+def _parse_interval(key: str, node: Mapping[str, Any], where: str) -> Range:
+    low, high = (_parse_number(node.get(end), f"{where}.{end}") for end in ("low", "high"))
     log, step, first = node.get("log", False), node.get("step"), node.get("first")
     if not isinstance(log, bool):
         raise InputError(f"{where}.log={log}: must be true or false")
     if low >= high:
-        raise InputError(f"{where}.high={high}: must be more than low={low}")
+        raise InputError(f"{where}.high={high}: must be greater than low={low}")
     if log and low <= 0:
         raise InputError(f"{where}.low={low}: must be above 0 with log")
-    if step is not None and (log or _number(step, f"{where}.step") <= 0):
-        raise InputError(f"{where}.step={step}: must be above 0, and does not go with log")
+    if step is not None and (log or _parse_number(step, f"{where}.step") <= 0):
+        raise InputError(f"{where}.step={step}: must be above 0, and cannot be combined with log")
     for name, value in (("step", step), ("first", first)):
         if isinstance(low, int) and isinstance(high, int) and not isinstance(value, int | None):
-            raise InputError(f"{where}.{name}={value}: must be a whole number, as low and high are")
+            raise InputError(
+                f"{where}.{name}={value}: must be a whole number if low and high are whole numbers"
+            )
     if step is not None and step > high - low:
         raise InputError(f"{where}.step={step}: must be at most high - low")
     if step is not None and first is not None and abs((first - low) / step % 1 - 0.5) < 0.5 - 1e-9:
-        raise InputError(f"{where}.first={first}: must be low or some steps above it")
+        raise InputError(f"{where}.first={first}: must be low plus a multiple of step")
     return Range(key, low, high, log, step, first=first)
 
 
-def _objective(text: str) -> Objective:
+def _parse_objective(text: str) -> Objective:
     """Parse an objective such as "MPJPE", or "MPJPE + 0.1*position Jitter"."""
-    terms = [_term(part.strip(), text) for part in text.split("+")]
+    terms = [_parse_term(part.strip(), text) for part in text.split("+")]
     return Objective(text, tuple(terms))
 
 
-def _term(part: str, text: str) -> tuple[float, str]:
-    """Parse a term into weight and metric; a metric without a branch is the rotation branch's."""
+def _parse_term(part: str, text: str) -> tuple[float, str]:
+    """Parse a term into weight and metric. A metric without a branch is measured on the rotation branch."""
     match = re.fullmatch(r"(?:(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*\*\s*)?(?:(\w+)\s+)??(\w+(?: PE)?)", part)
     branch, metric = (match[2] or OBJECTIVE_BRANCHES[0], match[3]) if match else ("", "")
     if match is None or metric not in UNITS or branch not in OBJECTIVE_BRANCHES:
         names, branches = ", ".join(UNITS), " or ".join(OBJECTIVE_BRANCHES)
         raise InputError(
-            f"search.objectives: '{text}'; expected a sum of [WEIGHT*][{branches}] METRIC "
-            f"with a metric of {names}"
+            f"search.objectives: '{text}'; expected a sum of terms [WEIGHT*][{branches}] METRIC "
+            f"with METRIC one of {names}"
         )
     if metric in HIGHER:
-        raise InputError(f"search.objectives: '{text}'; {metric} is better if higher, so not minimised")
+        raise InputError(
+            f"search.objectives: '{text}'; higher values of {metric} are better, so it cannot be minimised"
+        )
     weight = float(match[1] or 1)
     if not 0 < weight < math.inf:
         raise InputError(f"search.objectives: '{text}'; weights must be above 0")
     return weight, f"{branch} {metric}"
 
 
-def _number(value: Any, name: str) -> float | int:
+def _parse_number(value: Any, name: str) -> float | int:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{name}: {'nothing' if value is None else value}; expected a number")
     return value

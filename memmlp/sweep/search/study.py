@@ -1,9 +1,8 @@
-"""The Optuna study of a search. A single process owns it: it asks for trials and records how they ended.
+"""The Optuna study of a search. A single process owns it, which asks for trials and records their results.
 
-A trial has these user attributes: "runs" are the ids of its runs so far, one for each seed; "values" are each
-seed's objectives, whose means over seeds are the trial's own values; "reason" says why it failed. Whenever
-the owner is killed, the next owner finds every trial either ended or running, and continues the running ones
-under their numbers.
+A trial has these user attributes. "runs": the ids of its runs, one for each requested seed. "values": the
+objectives of each seed; the trial's values are the means over seeds. "reason": why the trial failed. If the
+owner is killed, the next owner continues the running trials with the same numbers.
 """
 
 from __future__ import annotations
@@ -30,26 +29,26 @@ from memmlp.common.files import atomic_write
 from memmlp.common.lease import check_owner
 from memmlp.sweep.search.search_file import Range, Search, Value
 
-BEGINNING = b'{"op_code":'  # how every line of a journal begins
+LINE_START = b'{"op_code":'  # the start of every line of a journal
 
 
 class Study:
-    """The trials of a search, in a storage that outlives its owner."""
+    """The trials of a search, in a persistent storage."""
 
     def __init__(self, search: Search, study: optuna.Study):
         self.search, self.study = search, study
 
     @classmethod
     def open(cls, search: Search, name: str, folder: Path) -> Study:
-        """Return the study with that name, new or as it was left, for its only owner.
+        """Open or create the study with this name. The calling process becomes its only owner.
 
         Args:
             search: the search.
             name: the study's name in the storage.
-            folder: the folder of the journal, if the search names no storage.
+            folder: the folder of the journal, which is used if the search has no storage URL.
 
         Raises:
-            InputError: if the storage can't be opened.
+            InputError: if the storage cannot be opened.
         """
         if search.storage is None:
             repair_journal(journal_path(folder))
@@ -67,13 +66,13 @@ class Study:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)
                 study.set_metric_names([objective.text for objective in search.objectives])
-        for values in search.first_trials():
+        for values in search.list_first_trials():
             study.enqueue_trial(values, skip_if_exists=True)
         return cls(search, study)
 
     @classmethod
     def view(cls, search: Search, name: str, folder: Path) -> Study | None:
-        """Return the study for reading while its owner works; None if it does not exist yet."""
+        """Open the study for reading, also while its owner works. Return None if it does not exist."""
         if search.storage is None and not journal_path(folder).exists():
             return None
         try:
@@ -84,49 +83,51 @@ class Study:
 
     @property
     def trials(self) -> list[FrozenTrial]:
-        """All trials that were asked for, ordered by number."""
+        """All started trials, ordered by number."""
         trials = self.study.get_trials(deepcopy=False)
         return [trial for trial in trials if trial.state != TrialState.WAITING]
 
-    def running(self) -> Iterator[Trial]:
-        """Yield the trials that have not ended, each with all its values.
+    def list_running(self) -> Iterator[Trial]:
+        """Yield the running trials. Missing values are suggested first.
 
-        Their last owner may have been killed before they had all of them.
+        Values are missing if the last owner was killed while it suggested them.
         """
         for trial in self.trials:
             if trial.state == TrialState.RUNNING:
-                self.study.sampler = sampler(self.search, trial.number)
-                yield self._suggest(Trial(self.study, trial._trial_id))
+                self.study.sampler = make_sampler(self.search, trial.number)
+                yield self._suggest_values(Trial(self.study, trial._trial_id))
 
     @property
-    def full(self) -> bool:
-        """Whether there are as many trials as the search wants."""
+    def is_full(self) -> bool:
+        """Whether the study has all trials of the search."""
         return len(self.trials) >= self.search.n_trials
 
     def ask(self) -> Trial:
-        """Return a new trial."""
-        self.study.sampler = sampler(self.search, len(self.trials))
-        return self._suggest(self.study.ask())
+        """Start a trial and return it."""
+        self.study.sampler = make_sampler(self.search, len(self.trials))
+        return self._suggest_values(self.study.ask())
 
-    def _suggest(self, trial: Trial) -> Trial:
+    def _suggest_values(self, trial: Trial) -> Trial:
         for one in self.search.space:
-            suggest(trial, one)
+            suggest_value(trial, one)
         return trial
 
     def prune(self, trial: Trial) -> bool:
-        """End the trial if other trials were better at its step, and return whether it was ended."""
+        """End the trial if the pruner decides so, and return whether it was ended."""
         if self.search.pruner == "none" or not trial.should_prune():
             return False
         self.study.tell(trial.number, state=TrialState.PRUNED)
         return True
 
     def complete(self, trial: Trial, values: Sequence[Sequence[float]]) -> None:
-        """End the trial with its objectives' means over seeds. A mean that is NaN makes the trial a failure.
+        """End the trial with each objective's mean over seeds. The trial fails if a mean is NaN.
 
-        `values` has a list for each seed, with the value of each objective.
+        Args:
+            trial: the trial.
+            values: each seed's objectives.
         """
         trial.set_user_attr("values", [list(seed) for seed in values])
-        means = [fmean(of_seeds) for of_seeds in zip(*values, strict=True)]
+        means = [fmean(objective) for objective in zip(*values, strict=True)]
         names = [
             one.text for one, mean in zip(self.search.objectives, means, strict=True) if math.isnan(mean)
         ]
@@ -137,12 +138,12 @@ class Study:
             self.study.tell(trial.number, means, skip_if_finished=True)
 
     def fail(self, trial: Trial, reason: str) -> None:
-        """End the trial as failed, without values."""
+        """End the trial as failed."""
         trial.set_user_attr("reason", reason)
         self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
-    def best(self) -> list[FrozenTrial]:
-        """Return the best trial; with two objectives the Pareto front, sorted by the first objective."""
+    def list_best(self) -> list[FrozenTrial]:
+        """Return the best trial, or with two objectives the Pareto front sorted by the first objective."""
         if all(trial.state != TrialState.COMPLETE for trial in self.trials):
             return []
         if len(self.search.objectives) == 1:
@@ -151,27 +152,29 @@ class Study:
 
 
 class FencedJournal(JournalFileBackend):
-    """A journal that needs no lock, since only its folder's present owner appends to it."""
+    """A journal without a lock file, because only the current owner of its folder appends to it."""
 
     def __init__(self, path: Path):
         super().__init__(str(path))
         self.path = path
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Append lines to the journal. Raises LeaseLost if its folder has another owner now."""
+        """Append lines to the journal. Raises LeaseLost if another process now owns its folder."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
         with open(self.path, "ab") as file:
-            check_owner(self.path)  # after opening: `repair_journal` gave a later owner another file
+            check_owner(
+                self.path
+            )  # after opening, because `repair_journal` of a later owner replaces the file
             file.write(lines.encode())
             file.flush()
             os.fsync(file.fileno())
 
 
 def open_storage(url: str | None, folder: Path) -> BaseStorage:
-    """Return the storage of a URL, or for None the journal in a folder.
+    """Open the storage at a URL, or the journal in a folder if the URL is None.
 
     Raises:
-        InputError: for a bad URL or a damaged journal.
+        InputError: for an invalid URL or a damaged journal.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     if url:
@@ -187,20 +190,19 @@ def open_storage(url: str | None, folder: Path) -> BaseStorage:
             warnings.simplefilter("ignore", ExperimentalWarning)
             return JournalStorage(FencedJournal(path))
     except (ValueError, KeyError, TypeError) as error:
-        raise _damaged(path, error) from None
+        raise _make_damage_error(path, error) from None
 
 
 def journal_path(folder: Path) -> Path:
-    """Return the journal file of a search's study, which `optuna-dashboard` can read."""
+    """Return the path of the journal in a search's folder. `optuna-dashboard` can read the file."""
     return folder / "study.journal"
 
 
 def repair_journal(path: Path) -> None:
-    """Replace a journal by a copy without an incomplete last line, which a killed process may leave.
+    """Replace a journal by a copy without an incomplete last line. Only the owner may call this.
 
-    Only for the owner. Optuna takes a line that is appended to an incomplete one for damage. If an earlier
-    owner was frozen and wakes up, it appends to the file that it has open, which is no longer this one, so it
-    changes nothing.
+    A killed process may leave an incomplete line, and Optuna cannot read lines after it. An earlier owner
+    that resumes after a freeze appends to the replaced file, so it does not change the copy.
     """
     check_journal(path)
     if path.exists():
@@ -209,25 +211,25 @@ def repair_journal(path: Path) -> None:
 
 
 def check_journal(path: Path) -> None:
-    """Raise InputError for a file that is not a journal, which Optuna would take for an empty one."""
+    """Raise InputError for a file that is not a journal. Optuna would read it as an empty journal."""
     if path.exists():
         with open(path, "rb") as file:
-            begins = file.read(len(BEGINNING))
-        if not BEGINNING.startswith(begins):
-            raise _damaged(path, "it does not begin like one")
+            begins = file.read(len(LINE_START))
+        if not LINE_START.startswith(begins):
+            raise _make_damage_error(path, "unknown first line")
 
 
-def _damaged(path: Path, reason: object) -> InputError:
-    return InputError(f"{path}: not a journal of Optuna's ({reason}); move it away to restart the search")
+def _make_damage_error(path: Path, reason: object) -> InputError:
+    return InputError(f"{path}: must be an Optuna journal ({reason}); move it away to restart the search")
 
 
-def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
-    """Return the sampler of one trial, seeded by the search and the trial's number.
+def make_sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
+    """Return the sampler of a trial, seeded with the search's seed and the trial's number.
 
-    So a resumed search does not repeat the random numbers of its earlier trials.
+    With the number, a resumed search does not repeat the random numbers of earlier trials.
     """
     seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
-    if search.startup is None or search.sampler != "tpe":  # a grid's trials have their values already
+    if search.startup is None or search.sampler != "tpe":  # the trials of a grid already have values
         return optuna.samplers.RandomSampler(seed=seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)
@@ -236,8 +238,8 @@ def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
         )
 
 
-def suggest(trial: Trial, one: Range) -> Value:
-    """Return a trial's value for a key: its existing value, or a new one."""
+def suggest_value(trial: Trial, one: Range) -> Value:
+    """Return a trial's value for a range's key; Optuna chooses it on the first call."""
     if one.choices:
         return trial.suggest_categorical(one.key, one.choices)
     if isinstance(one.low, int) and isinstance(one.high, int):
@@ -245,19 +247,19 @@ def suggest(trial: Trial, one: Range) -> Value:
     return trial.suggest_float(one.key, one.low, one.high, step=one.step, log=one.log)
 
 
-def reason(trial: FrozenTrial) -> str:
-    """Return why a trial failed, or at which step and with what value it was pruned; else nothing."""
+def get_reason(trial: FrozenTrial) -> str:
+    """Return why a trial failed, or the value and the step at which it was pruned; else an empty text."""
     if trial.state == TrialState.PRUNED and trial.values:
         return f"{trial.values[0]:.4g} at step {trial.last_step}"
     return str(trial.user_attrs.get("reason", ""))
 
 
-def deviations(trial: FrozenTrial) -> list[float]:
-    """Return each objective's standard deviation over seeds; empty with fewer than two seeds."""
+def compute_deviations(trial: FrozenTrial) -> list[float]:
+    """Return each objective's standard deviation over seeds; an empty list with fewer than two seeds."""
     by_seed = trial.user_attrs.get("values", [])
     return np.std(by_seed, axis=0, ddof=1).tolist() if len(by_seed) > 1 else []
 
 
-def trial_values(trial: FrozenTrial | Trial, search: Search) -> Mapping[str, Value]:
-    """Return a trial's values by config key, in the order of the search's space."""
+def get_values(trial: FrozenTrial | Trial, search: Search) -> Mapping[str, Value]:
+    """Return a trial's values by config key, in the order of `search.space`."""
     return {one.key: trial.params[one.key] for one in search.space}

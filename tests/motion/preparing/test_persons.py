@@ -15,7 +15,7 @@ from conftest import Memmlp
 
 from memmlp.common.errors import InputError
 from memmlp.config.build_request import build_motion
-from memmlp.config.compose import composed
+from memmlp.config.compose import compose_config
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.motion_source import MotionSource
@@ -35,7 +35,7 @@ def split(**changes: Any) -> PersonSplit:
 def shipped(tmp_path: Path) -> MotionSource:
     (tmp_path / "clips").mkdir()
     outputs = f"paths.outputs={tmp_path / 'outputs'}"
-    return build_motion(composed(["data=persons", f"data.root={tmp_path / 'clips'}", outputs]))
+    return build_motion(compose_config(["data=persons", f"data.root={tmp_path / 'clips'}", outputs]))
 
 
 def members(persons: Iterable[str]) -> list[str]:

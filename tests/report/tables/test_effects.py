@@ -199,7 +199,7 @@ def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(
     find = fake_sweep(tmp_path, sweep, EFFECTS)
     before = table_of(sweep, find)
     variant = next(variant for variant in sweep.variants if variant.label == label)
-    for one, seed in [(one, seed) for one in sweep.runnable() for seed in sweep.seeds]:
+    for one, seed in [(one, seed) for one in sweep.list_runnable() for seed in sweep.seeds]:
         path = find(one, seed).evaluation("stream-0")
         report = json.loads(path.read_text())
         for branch in ("rotation", "position"):

@@ -33,7 +33,7 @@ def flags(sweep: Sweep, tmp_path: Path) -> Callable[..., list[str]]:
         part = replace(sweep, seeds=seeds, **changes)
         runs = {
             (one.label, seed): fake_run(tmp_path, one.label, seed, **settings(one.label, seed))
-            for one in part.runnable()
+            for one in part.list_runnable()
             for seed in seeds
         }
         table = table_of(part, lambda variant, seed: runs[variant.label, seed])
@@ -51,7 +51,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def runs_in(sweep: Sweep, find: Callable[..., Run | None]) -> dict[tuple[str, int], Run]:
-    found = {(one.label, seed): find(one, seed) for one in sweep.runnable() for seed in sweep.seeds}
+    found = {(one.label, seed): find(one, seed) for one in sweep.list_runnable() for seed in sweep.seeds}
     return {key: run for key, run in found.items() if run is not None}
 
 
@@ -91,7 +91,7 @@ def test_unequal_clips_are_left_out(sweep: Sweep, tmp_path: Path):
         (variant.label, seed): fake_run(
             tmp_path, variant.label, seed, clips=CLIPS[:3] if variant.label == "full_model" else CLIPS[1:4]
         )
-        for variant in sweep.runnable()
+        for variant in sweep.list_runnable()
         for seed in (0, 1)
     }
     table = table_of(replace(sweep, seeds=(0, 1)), lambda variant, seed: runs[variant.label, seed])
@@ -125,12 +125,12 @@ def test_clips_on_which_a_network_diverged(sweep: Sweep, tmp_path: Path, word: s
             lambda report: [report["clips"][0][b].update(MPJPE="nan") for b in ("rotation", "position")],
         )
     (flag,) = (flag for flag in table_of(sweep, find).flags if flag.startswith("NaN errors"))
-    assert all(f"'{variant.label}' seed 0 (1 clips)" in flag for variant in sweep.runnable())
+    assert all(f"'{variant.label}' seed 0 (1 clips)" in flag for variant in sweep.list_runnable())
 
 
 def test_a_mean_of_fewer_seeds_than_its_row_counts(sweep: Sweep, tmp_path: Path):
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
-    variant = sweep.runnable()[0]
+    variant = sweep.list_runnable()[0]
     for mode in ("stream", "window"):
         del runs[variant.label][1].means[mode][variant.branch]["Jitter"]
     del runs[variant.label][2].costs["ms"]
@@ -225,7 +225,7 @@ def test_times_of_a_busy_machine(sweep: Sweep, tmp_path: Path, changed: dict[str
 def test_groups_that_differ_between_runs(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep, groups={clip: f"take {i // 2}" for i, clip in enumerate(CLIPS)})
     assert not any("data.split.groups" in flag for flag in table_of(sweep, find).flags)
-    for path in find(sweep.runnable()[0], 1).evaluations.glob("*.json"):
+    for path in find(sweep.list_runnable()[0], 1).evaluations.glob("*.json"):
         edit(path, lambda report: report["clips"][0].update(group="alone"))
     assert any("runs differ in the groups of test clips" in flag for flag in table_of(sweep, find).flags)
 
@@ -372,7 +372,7 @@ def test_offline_networks_in_every_format(sweep: Sweep, tmp_path: Path):
     late = {"by position": {"offline": True}}
     runs = {
         variant.label: fake_run(tmp_path, variant.label, evaluated=late.get(variant.label))
-        for variant in sweep.runnable()
+        for variant in sweep.list_runnable()
     }
     table = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label])
     assert "offline: uses future frames: 'by position'" in table.flags
@@ -458,7 +458,7 @@ def test_warnings_about_the_data(
     flags: Callable[..., list[str]], sweep: Sweep, tmp_path: Path, fact: str, warning: str, ending: str
 ):
     """Kept results know them, too."""
-    labels = [variant.label for variant in sweep.runnable()]
+    labels = [variant.label for variant in sweep.list_runnable()]
     found = flags(warning, lambda label, _: {"origin": {fact: warning} if label != labels[0] else None})
     assert found == [f"{warning}{ending}: {', '.join(map(repr, labels[1:]))}"]
     measured = runs_of(

@@ -63,7 +63,7 @@ def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
         variant.label: fake_run(
             tmp_path, variant.label, evaluated=other if variant.label == "by position" else None
         )
-        for variant in sweep.runnable()
+        for variant in sweep.list_runnable()
     }
     said = " ".join(table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label]).flags)
     assert "0123456, fedcba9 of 'by position'" in said
@@ -158,7 +158,7 @@ def test_times_are_of_undisturbed_seeds(
 ):
     """Seed 0 took 1 ms, seed 1 took 3 ms, and so on; all other columns are of all seeds."""
     find = fake_sweep(tmp_path, sweep)
-    for variant in sweep.runnable():
+    for variant in sweep.list_runnable():
         for seed, share in enumerate(shares):
             path = find(variant, seed).deployment("fp32-0").latency
             known = {"core_share": share} if share is not None else {}
@@ -179,4 +179,4 @@ def test_times_are_of_undisturbed_seeds(
 
 
 def _each(sweep: Sweep, number: int) -> str:
-    return ", ".join(f"'{variant.label}' ({number} of 3)" for variant in sweep.runnable())
+    return ", ".join(f"'{variant.label}' ({number} of 3)" for variant in sweep.list_runnable())

@@ -66,12 +66,14 @@ class World:
     def __init__(self, sweep: Sweep = SWEEP, draw: Draw = planted, groups: Mapping[str, str] | None = None):
         self.sweep, self.draw, self.groups = sweep, draw, groups or {}
         self.failing: set[tuple[str, int]] = set()
-        self.runs: dict[str, dict[int, MeasuredRun]] = {variant.label: {} for variant in sweep.runnable()}
+        self.runs: dict[str, dict[int, MeasuredRun]] = {
+            variant.label: {} for variant in sweep.list_runnable()
+        }
 
     def spend(self, rounds: Rounds) -> Mapping[str, RunsBySeed]:
         spent = rounds.restrict_sweep(self.sweep)
-        for variant in spent.runnable():
-            for seed in set(spent.seeds_of(variant)) - self.runs[variant.label].keys():
+        for variant in spent.list_runnable():
+            for seed in set(spent.get_seeds(variant)) - self.runs[variant.label].keys():
                 if (variant.label, seed) not in self.failing:
                     metrics = tuple(metric for metric in self.sweep.metrics if metric != "FLOPs")
                     self.runs[variant.label][seed] = run(variant.label, seed, self.draw, metrics, self.groups)
@@ -104,10 +106,10 @@ def test_the_schedule_is_fixed_at_the_start():
     assert sum(rounds.levels) == pytest.approx(0.05)
     assert rounds.find_next_analyses(SWEEP) == {"worse": 0, "same": 0, "unsure": 0}
     spent = rounds.restrict_sweep(SWEEP)
-    assert {variant.label: spent.seeds_of(variant) for variant in spent.runnable()} == dict.fromkeys(
+    assert {variant.label: spent.get_seeds(variant) for variant in spent.list_runnable()} == dict.fromkeys(
         TRUTH, (4, 2, 5)
     )
-    assert len(spent.variant_seeds()) == 12
+    assert len(spent.list_variant_seeds()) == 12
     assert start_rounds(SWEEP, 1 + 2).schedule == (3,)
 
 

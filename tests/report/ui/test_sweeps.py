@@ -98,7 +98,7 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite
     )
     say = make_state_finder(Plan.load(path))
     variant = next(
-        variant for variant in load_sweep_copy(path.parent).runnable() if variant.label == first.label
+        variant for variant in load_sweep_copy(path.parent).list_runnable() if variant.label == first.label
     )
     assert say(variant, first.seed) == "trained, an evaluation or export is missing"
 

@@ -42,7 +42,7 @@ def test_bad_options_are_one_line(words: dict[str, str], line: str):
 def test_a_cluster_must_be_named(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("distributed")
     monkeypatch.delenv("DASK_SCHEDULER_ADDRESS", raising=False)
-    with pytest.raises(InputError, match=r"dask.address=HOST:PORT of a scheduler is missing"):
+    with pytest.raises(InputError, match=r"dask\.address=HOST:PORT"):
         Dask({})
 
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 from processes import ignoring_interrupts, until
 
-from memmlp.sweep.executors.local import Debug, Local, visible_gpus
+from memmlp.sweep.executors.local import DebugExecutor, LocalExecutor, list_visible_gpus
 
 
 def touch(path: str) -> None:
@@ -23,7 +23,7 @@ def touch(path: str) -> None:
 
 
 def test_a_debug_worker_works_in_this_process(tmp_path: Path):
-    (handle,) = Debug().submit(partial(touch, str(tmp_path / "done")))
+    (handle,) = DebugExecutor().submit(partial(touch, str(tmp_path / "done")))
     assert not handle.alive()  # it works when it is asked
     assert (tmp_path / "done").exists()
     assert handle.complaint() is None
@@ -34,7 +34,7 @@ def test_a_worker_imports_the_package_that_starts_it(tmp_path: Path, monkeypatch
     (tmp_path / "memmlp").mkdir()
     (tmp_path / "memmlp" / "__init__.py").write_text("")
     monkeypatch.chdir(tmp_path)
-    (handle,) = Local(tmp_path / "%j").submit(partial(touch, str(tmp_path / "done")))
+    (handle,) = LocalExecutor(tmp_path / "%j").submit(partial(touch, str(tmp_path / "done")))
     until(lambda: not handle.alive(), "the worker ends")
     assert (tmp_path / "done").exists()
 
@@ -43,7 +43,7 @@ def test_a_worker_imports_the_package_that_starts_it(tmp_path: Path, monkeypatch
 def test_a_cancelled_local_worker_ends(tmp_path: Path, around):
     """Also where interrupts are ignored."""
     with around():
-        (handle,) = Local(tmp_path / "%j").submit(partial(time.sleep, 6000))
+        (handle,) = LocalExecutor(tmp_path / "%j").submit(partial(time.sleep, 6000))
     assert handle.alive()
     handle.cancel()
     until(lambda: not handle.alive(), "the worker ends")
@@ -57,7 +57,7 @@ def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path:
     go = tmp_path / "go"
     waits = f"while [ ! -e {go} ]; do sleep 0.05; done; echo $CUDA_VISIBLE_DEVICES"
     work = partial(subprocess.getoutput, waits)
-    executor = Local(tmp_path / "%j", [("0",), ("1",)])
+    executor = LocalExecutor(tmp_path / "%j", [("0",), ("1",)])
     workers = executor.submit(work, 4)
     assert executor.gpus
     assert [variable(worker) for worker in workers] == ["0", "1", "0", "1"]
@@ -65,7 +65,7 @@ def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path:
     until(lambda: not workers[1].alive(), "the worker is dead")
     workers += executor.submit(work)
     assert variable(workers[4]) == "1"
-    bare = Local(tmp_path / "%j")
+    bare = LocalExecutor(tmp_path / "%j")
     workers += bare.submit(work)
     assert not bare.gpus
     assert variable(workers[5]) == ""
@@ -93,8 +93,8 @@ def test_visible_gpus_are_those_of_the_variable_or_all(monkeypatch: pytest.Monke
         ("MIG-a,MIG-b", ("MIG-a", "MIG-b")),
     ):  # fmt: skip
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", text)
-        assert visible_gpus() == found
+        assert list_visible_gpus() == found
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     for count in (0, 2):
         monkeypatch.setattr(torch.cuda, "device_count", lambda count=count: count)
-        assert visible_gpus() == ("0", "1")[:count]
+        assert list_visible_gpus() == ("0", "1")[:count]

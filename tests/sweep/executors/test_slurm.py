@@ -8,11 +8,19 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.executors.slurm import Requeued, Slurm, SlurmOptions, batch_script, slurm_options
+from memmlp.sweep.executors.slurm import (
+    RequeuedWork,
+    Slurm,
+    SlurmOptions,
+    format_batch_script,
+    parse_slurm_options,
+)
 
 
 def lines(tmp_path: Path, workers: int = 1, **words: str) -> list[str]:
-    return batch_script(tmp_path / "%j", slurm_options({"time": "60", **words}), workers).splitlines()
+    return format_batch_script(
+        tmp_path / "%j", parse_slurm_options({"time": "60", **words}), workers
+    ).splitlines()
 
 
 def test_options_reach_sbatch(tmp_path: Path):
@@ -34,7 +42,7 @@ def test_times_are_slurms(tmp_path: Path):
         ("90", 90), ("90:30", 91), ("10:00:00", 600), ("1:30:01", 91), ("2-0", 2880), ("7-12:30", 10830),
         ("1-02:03:00", 1563),
     ):  # fmt: skip
-        assert slurm_options({"time": text}).minutes == minutes
+        assert parse_slurm_options({"time": text}).minutes == minutes
         assert f"#SBATCH --time={text}" in lines(tmp_path, time=text)
 
 
@@ -54,7 +62,7 @@ def test_whether_a_job_is_to_have_a_gpu():
         ({"gres": "gpu:1"}, True),
         ({"gres": "disk:1"}, False), ({"mem_per_gpu": "8G"}, False), ({}, False),
     ):  # fmt: skip
-        assert slurm_options({"time": "60", **settings}).gpu is gpu, settings
+        assert parse_slurm_options({"time": "60", **settings}).gpu is gpu, settings
 
 
 def test_bad_options_are_one_line():
@@ -67,7 +75,7 @@ def test_bad_options_are_one_line():
         ({"comment": ""}, "expected the long name"), ({"gpus": "1"}, "slurm.time: has no value"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=line) as error:
-            slurm_options(settings)
+            parse_slurm_options(settings)
         assert "\n" not in str(error.value)
 
 
@@ -92,7 +100,7 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_workers_are_submitted_at_once(tmp_path: Path, cluster: Path):
-    slurm = Slurm(tmp_path / "logs" / "%j", slurm_options({"gpus": "1", "time": "1-0"}))
+    slurm = Slurm(tmp_path / "logs" / "%j", parse_slurm_options({"gpus": "1", "time": "1-0"}))
     handles = slurm.submit(partial(print, "work"), 3)
     assert slurm.gpus
     assert [handle.job.job_id for handle in handles] == ["42_0", "42_1", "42_2"]
@@ -116,11 +124,11 @@ def test_what_sbatch_refuses_is_one_line(tmp_path: Path, cluster: Path):
         "#!/bin/sh\necho \"sbatch: unrecognized option '--patition=x'\" >&2; exit 1\n"
     )
     with pytest.raises(InputError, match=r"executor=slurm: .*unrecognized option '--patition=x'") as error:
-        Slurm(tmp_path / "logs" / "%j", slurm_options({"time": "60", "patition": "x"})).submit(print)
+        Slurm(tmp_path / "logs" / "%j", parse_slurm_options({"time": "60", "patition": "x"})).submit(print)
     assert "\n" not in str(error.value)
 
 
 def test_preempted_work_is_queued_again(tmp_path: Path):
-    work = Requeued(partial((tmp_path / "again").write_text, "done"))
+    work = RequeuedWork(partial((tmp_path / "again").write_text, "done"))
     work.checkpoint().function()
     assert (tmp_path / "again").exists()

@@ -26,7 +26,7 @@ from optuna.trial import TrialState
 from memmlp.common.errors import InputError
 from memmlp.sweep.plan import RunTask
 from memmlp.sweep.search import study as study_module
-from memmlp.sweep.search.progress_table import figures
+from memmlp.sweep.search.progress_table import format_objectives
 from memmlp.sweep.search.search_file import Value
 from memmlp.sweep.search.study import Study
 
@@ -39,7 +39,7 @@ def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
     assert len({run for trial in study.trials for run in trial.user_attrs["runs"]}) == 6
     for trial in study.trials:
         assert trial.value == pytest.approx(error({"values": trial.params, "seed": 0}))
-    assert study.best()[0].value == min(trial.value for trial in study.trials)
+    assert study.list_best()[0].value == min(trial.value for trial in study.trials)
 
 
 @pytest.mark.parametrize("moment", range(4))
@@ -53,7 +53,7 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
     before = [trial.number for trial in study.trials]
 
     calls = 0
-    whole = study_module.suggest
+    whole = study_module.suggest_value
 
     def killed(*arguments: Any) -> Value:
         nonlocal calls
@@ -68,7 +68,7 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
         return compose(values)
 
     with monkeypatch.context() as patch:
-        patch.setattr(study_module, "suggest", killed)
+        patch.setattr(study_module, "suggest_value", killed)
         one.compose = composed
         if moment < 3:
             with pytest.raises(KeyboardInterrupt):
@@ -128,7 +128,7 @@ def test_values_that_make_no_sense_fail_their_trial_and_hopeless_searches_end(tm
 
     study = open_study(tmp_path, n_trials=20)
     one = director(study, tmp_path, refused)
-    with pytest.raises(InputError, match="all 5 trials failed, the last one: hand=position needs"):
+    with pytest.raises(InputError, match="all 5 trials failed; the last error: hand=position needs"):
         one.update(2)
 
 
@@ -144,7 +144,7 @@ def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Pa
         assert not {task.id for task in plan.tasks} & set(plan.cancelled)
         (task,) = plan.tasks
         seen.add(task.id)
-        run = plan.run_of(task)
+        run = plan.get_run(task)
         if not run.done:
             run.begin("memmlp", task.config, data="d", prerequisite=None)
             log(run, 10, 5.0 if not seen - {task.id} else 9.0)
@@ -166,7 +166,7 @@ def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
         assert [value for (value,) in trial.user_attrs["values"]] == pytest.approx(
             [first, first + 0.3, first + 0.6]
         )
-        assert figures(trial) == f"{trial.value:.3f} ± 0.300"
+        assert format_objectives(trial) == f"{trial.value:.3f} ± 0.300"
         assert len(set(trial.user_attrs["runs"])) == 3
 
 
@@ -181,7 +181,7 @@ def test_the_other_seeds_wait_for_the_first_ones_end_and_count_for_capacity(tmp_
     assert [(entry.label, entry.seed) for entry in plan.entries] == [
         ("trial 0", 0), ("trial 0", 1), ("trial 0", 2), ("trial 1", 0),
     ]  # fmt: skip
-    assert len(plan.left()) == 3
+    assert len(plan.list_remaining()) == 3
     assert one.update(4).entries[-1].label == "trial 2"
 
 
@@ -190,16 +190,16 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
     one = seeded(study, tmp_path)
     for level in (5.0, 6.0):
         for _ in range(2):
-            run = begun(replace(plan := one.update(1), tasks=tuple(plan.left())))
+            run = begun(replace(plan := one.update(1), tasks=tuple(plan.list_remaining())))
             for step in (10, 20, STEPS):
                 log(run, step, level)
             run.finish([])
     run = begun(one.update(1))
     log(run, 10, 50.0)
     run.finish([])  # done before the director looks, so that it is not pruned
-    second = begun(replace(plan := one.update(1), tasks=tuple(plan.left())))
+    second = begun(replace(plan := one.update(1), tasks=tuple(plan.list_remaining())))
     log(second, 20, 50.0)  # a further bad seed enters the mean, but doesn't end the trial
-    assert second.id in {task.id for task in one.update(1).left()}
+    assert second.id in {task.id for task in one.update(1).list_remaining()}
     assert study.trials[2].intermediate_values == {10: 50.0}
     second.fail("not of interest here")
     run = begun(one.update(1))
@@ -229,4 +229,7 @@ def test_validations_of_a_network_used_otherwise_are_no_trials(tmp_path: Path):
             finish(plan)
         (trial,) = study.trials
         assert trial.state.name == state
-    assert "was validated with {'memory.blend': 0.5}, not {'memory.blend': 0.1}" in trial.user_attrs["reason"]
+    assert (
+        "was validated with {'memory.blend': 0.5}; expected {'memory.blend': 0.1}"
+        in trial.user_attrs["reason"]
+    )

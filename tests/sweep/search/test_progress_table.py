@@ -16,7 +16,7 @@ def test_a_log_has_the_running_trials_and_how_others_ended(tmp_path: Path):
     one, board, text = director(study, tmp_path), SearchBoard(tmp_path), io.StringIO()
     board.console = Console(file=text, width=200)
     plan = one.update(1)
-    run = plan.run_of(plan.tasks[0])
+    run = plan.get_run(plan.tasks[0])
     run.begin("memmlp", plan.tasks[0].config, data="d", prerequisite=None)
     with run.lock():
         board.update(study)

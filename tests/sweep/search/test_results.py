@@ -27,7 +27,7 @@ from optuna.trial import create_trial
 
 from memmlp.sweep.search import results
 from memmlp.sweep.search.search_file import Range
-from memmlp.sweep.search.study import Study, suggest
+from memmlp.sweep.search.study import Study, suggest_value
 
 
 def test_trials_of_several_seeds_as_csv(tmp_path: Path):
@@ -77,12 +77,12 @@ def test_a_trial_that_is_no_longer_of_the_front_has_no_file(tmp_path: Path):
 def test_two_objectives_give_a_front(tmp_path: Path):
     study = open_study(tmp_path, objectives=["MPJPE", "Jitter"])
     to_the_end(study, tmp_path)
-    front = study.best()
+    front = study.list_best()
     assert len(front) == 6  # Jitter is 20 less MPJPE here, so that none is better in both
     assert [trial.values[0] for trial in front] == sorted(trial.values[0] for trial in front)
     files = results.write_experiments(study, tmp_path, ["loss"])
     assert [file.name for file in files] == ["best.yaml", *(f"trial-{t.number}.yaml" for t in front[1:])]
-    assert list(results.plots(study)) == ["pareto_front", "parallel_coordinate", "slice"]
+    assert list(results.list_plots(study)) == ["pareto_front", "parallel_coordinate", "slice"]
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_what_a_search_leaves(tmp_path: Path):
     assert [row["trial"] for row in rows] == list("012345")
     assert [float(row["MPJPE"]) for row in rows] == [trial.value for trial in study.trials]
     (path,) = results.write_experiments(study, tmp_path, ["loss"])
-    best = study.best()[0]
+    best = study.list_best()[0]
     content = yaml.safe_load(path.read_text())
     assert content["defaults"] == [{"override /loss": "manual"}, "_self_"]
     assert {f"loss.{key}": value for key, value in content["loss"].items()} == best.params
@@ -158,9 +158,11 @@ def test_a_best_value_boundary_warnings_of_what_was_tried_is_told(tried, values,
     for number, value in enumerate(values):
         study.enqueue_trial({"optim.lr": value})
         trial = study.ask()
-        suggest(trial, Range("optim.lr", **{k: tuple(v) if k == "choices" else v for k, v in tried.items()}))
+        suggest_value(
+            trial, Range("optim.lr", **{k: tuple(v) if k == "choices" else v for k, v in tried.items()})
+        )
         study.tell(trial, -number)
-    found = results.boundary_warnings(study)
+    found = results.find_boundary_warnings(study)
     assert [line.startswith(f"optim.lr: the best value, {said}") for line in found] == [True] * bool(said)
 
 
@@ -177,15 +179,17 @@ def add_random_trials(
 def test_few_trials_have_no_importance():
     """It would be chance: an inert key ranks first in most random searches of ten trials."""
     study = optuna.create_study()
-    assert results.too_few_trials(study) is None
+    assert results.explain_missing_importances(study) is None
     add_random_trials(study, 24)
-    assert results.importances(study) == []
-    assert results.too_few_trials(study) == "needs 25 complete trials; with 24 it would be chance"
+    assert results.compute_importances(study) == []
+    assert (
+        results.explain_missing_importances(study) == "needs 25 complete trials; with 24 it would be chance"
+    )
 
 
 def test_of_enough_trials_the_key_that_acts_is_the_most_important():
     study = optuna.create_study()
     add_random_trials(study, results.ENOUGH_TRIALS)
-    (first, share), *rest = results.importances(study)
+    (first, share), *rest = results.compute_importances(study)
     assert (first, len(rest), share > 0.5) == ("acts", 2, True)
-    assert results.too_few_trials(study) is None
+    assert results.explain_missing_importances(study) is None

@@ -41,8 +41,8 @@ def test_a_tree_of_keys_becomes_ranges():
         Range("loss.hand", 0.1, 1.0),
         Range("hand", choices=("off", "fk"), first="fk"),
     )
-    assert found.first_trials() == [{"hand": "fk"}]
-    assert found.space[1].corners() == ("off", "fk")
+    assert found.list_first_trials() == [{"hand": "fk"}]
+    assert found.space[1].list_corners() == ("off", "fk")
 
 
 @pytest.mark.parametrize(

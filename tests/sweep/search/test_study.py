@@ -124,6 +124,6 @@ def test_a_team_storage_and_a_bad_one(tmp_path: Path):
 def test_what_is_no_journal_is_left_alone_and_named(tmp_path: Path, content: bytes):
     journal_path(tmp_path).write_bytes(content)
     for look in (open_study, lambda folder: Study.view(search(), "mine", folder)):
-        with pytest.raises(InputError, match=r"study.journal: not a journal of Optuna's"):
+        with pytest.raises(InputError, match=r"study.journal: must be an Optuna journal"):
             look(tmp_path)
     assert journal_path(tmp_path).read_bytes() == content
