@@ -29,7 +29,7 @@ def disable_sampling(model: nn.Module) -> Iterator[None]:
 
     torch and ONNX Runtime cannot use the same random numbers.
     """
-    sampled = [module for module in model.modules() if isinstance(module, Blend) and module.sampled]
+    sampled = [module for module in model.modules() if isinstance(module, Blend) and module.is_sampled]
     values = [blend.value for blend in sampled]
     try:
         for blend in sampled:

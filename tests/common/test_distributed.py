@@ -135,7 +135,7 @@ def test_a_batch_that_cannot_be_shared_is_refused(two: None):
 def test_layers_that_would_draw_or_count_by_themselves_are_refused(two: None, layer: nn.Module, name: str):
     task = motion_task()
     task.module.add_module("own", layer)
-    with pytest.raises(InputError, match=f"{name} on 2 processes"):
+    with pytest.raises(InputError, match=f"{name} with 2 processes"):
         check_processes(task, STEPS, "network")
 
 

@@ -112,7 +112,7 @@ class Different(type(tiny.baseline("avatar_poser"))):
 
 
 def test_a_network_without_a_streaming_graph_is_refused():
-    with pytest.raises(InputError, match=r"memory\.history=latest"):
+    with pytest.raises(InputError, match=r"memory\.history=first"):
         streaming(tiny.model(CodeMemory, history="latest"))
     model = tiny.baseline("avatar_poser")
     model.__class__ = Different

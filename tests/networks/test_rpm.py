@@ -19,7 +19,7 @@ def test_predictions_roll_as_an_independent_computation():
     model.predict = lambda *given: (news.append((given, made := 3 * predicted(*given))), made)[1]
     state, shown = model.initial_state(1), []
     for frame in SPARSE[:1].double().split(1, 1):
-        made, state = model.roll(model.encode(frame), state)
+        made, state = model.step_frame(model.encode(frame), state)
         shown.append(made[0].numpy())
     share = 1 - np.cos(np.arange(1, 5) / 4 * np.pi / 2)[:, None]
     expected = news[0][1][0].numpy()
@@ -50,8 +50,8 @@ def test_before_the_first_frame_are_its_inputs():
 def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_dropout):
     """The one step with gradient sees the inputs up to its own frame, and motion that has no gradient."""
     model, steps, training = tiny.baseline("rpm", own_dropout=own_dropout).train(), [], []
-    rolled = model.roll
-    model.roll = lambda *given: (steps.append((torch.is_grad_enabled(), given)), rolled(*given))[1]
+    rolled = model.step_frame
+    model.step_frame = lambda *given: (steps.append((torch.is_grad_enabled(), given)), rolled(*given))[1]
     predicted = model.predict
     model.predict = lambda *given: (training.append(model.layers[0].training), predicted(*given))[1]
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[0.1], [0.9]]))

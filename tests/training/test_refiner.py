@@ -58,5 +58,5 @@ def test_its_identity_is_of_all_that_its_pieces_follow_from():
 
 def test_several_processes_are_refused(monkeypatch):
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
-    with pytest.raises(InputError, match="refiner: several processes"):
+    with pytest.raises(InputError, match="refiner: must be null"):
         run_in_processes(experiment("refiner=sage"))
