@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.files import atomic_write
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES, Space
-from memmlp.motion.body import JOINTS, PARENTS, TRACKED, builtin_rest_joints
+from memmlp.motion.body import JOINTS, PARENTS, TRACKED, make_builtin_rest_joints
 from memmlp.motion.limb_shapes import RADII
 from memmlp.report.pictures.drawing import Camera, draw_skeleton, encode_png, freeze_layout, make_panels
 from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT, find_joint_colour
 
 IMAGES = Path(__file__).parent / "images"
 COLOURS = ("#d1242f", "#1a7f37", "#0969da")  # of X, Y and Z
-TREE = BodyTree(JOINTS, PARENTS, builtin_rest_joints())
+TREE = BodyTree(JOINTS, PARENTS, make_builtin_rest_joints())
 FACING = SPACES["openxr"].convert_rotations_to_amass(
     np.eye(3)
 )  # the root of a person who stands and looks forward

@@ -340,10 +340,10 @@ class Prediction:
             InputError: for another kind of file, or if the file can't be written.
         """
         from memmlp.evaluation.predictions import make_clip
-        from memmlp.motion.exporting import format_of, write_motion
+        from memmlp.motion.exporting import find_format, write_motion
 
         file = Path(path)
-        chosen = format_of(file)
+        chosen = find_format(file)
         rotations = self.true_rotations if truth else self.rotations
         positions = self.true_positions if truth else self.positions
         write_motion(file, make_clip(self.clip, rotations, positions, self.rest), self.rest, chosen)

@@ -104,7 +104,7 @@ def features() -> Numbers:
 
 def coordinates(kind: type[World]) -> Numbers:
     normalizer, clip = tiny.normalizer(kind()), tiny.clip(12)[None]
-    origin = normalizer.origin(clip[..., :SPARSE_DIM])
+    origin = normalizer.find_origin(clip[..., :SPARSE_DIM])
     encoded = normalizer.encode(clip)
     motion = encoded[..., SPARSE_DIM:] + 0.1
     return summary("encoded", encoded) | summary("decoded", normalizer.decode_motion(motion, origin))
@@ -145,7 +145,7 @@ def sampler() -> Numbers:
 
 def mirror() -> Numbers:
     clips, ends = torch.tensor([3, 1, 5]), torch.tensor([20, 30, 44])
-    return summary("frames", MirroredDataset(frames()).stretches(clips, ends, 9))
+    return summary("frames", MirroredDataset(frames()).read_stretches(clips, ends, 9))
 
 
 def schedule(name: str) -> Numbers:
@@ -214,7 +214,7 @@ def mode(name: str) -> Numbers:
     """The predictions of a mode for clips of unequal length, and the mean of their reports."""
     model, split = tiny.model(NoCodesMemory), frames()
     found = {}
-    for i, motion in enumerate(evaluation.MODE_FUNCTIONS[name](model, split.clips())):
+    for i, motion in enumerate(evaluation.MODE_FUNCTIONS[name](model, split.read_clips())):
         found |= summary(f"clip {i}", motion)
     mean = Evaluation([name], 2, NoIK(), 0).report(model, split, name)["mean"]["rotation"]
     return found | {key: mean[key] for key in ("MPJPE", "Jitter")}

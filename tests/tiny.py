@@ -12,9 +12,9 @@ import torch
 import yaml
 
 from memmlp.common.components import find_component, list_component_names
-from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
+from memmlp.motion.body import FRAME_DIM, make_builtin_rest_joints
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.geometry import motion_frames
+from memmlp.motion.geometry import compute_motion_frames
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
@@ -29,7 +29,7 @@ from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, LossOfNetwo
 
 SIZES = {"hidden": 16, "frames": 7}
 DEPTH = 4
-REST = torch.tensor(builtin_rest_joints())
+REST = torch.tensor(make_builtin_rest_joints())
 
 
 def clip(length: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
@@ -41,7 +41,7 @@ def clip(length: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
     poses = sum(waves[i] * np.sin(2 * math.pi * rate[i] * t + phase[i]) for i in range(3))
     poses[:, 0] = np.array([math.pi / 2, 0, 0]) + 0.1 * poses[:, 0]
     trans = np.cumsum(rng.normal(size=(length + 1, 3)) * 0.003, 0) + np.array([0, 0, 0.95])
-    return motion_frames(torch.tensor(poses), torch.tensor(trans), REST).float()
+    return compute_motion_frames(torch.tensor(poses), torch.tensor(trans), REST).float()
 
 
 def frames(lengths: tuple[int, ...] = (60, 45, 80), seed: int = 0) -> MotionDataset:

@@ -11,7 +11,7 @@ import torch
 
 from memmlp.live.stream import BodyFrame, Pose, Stream
 from memmlp.motion.body import TRACKED
-from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, motion_frames
+from memmlp.motion.geometry import axis_angle_to_matrix, compute_motion_frames, forward_kinematics
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 
@@ -54,7 +54,7 @@ def of_poses(poses: torch.Tensor, trans: torch.Tensor) -> Person:
     local = axis_angle_to_matrix(poses)
     rotations, positions = forward_kinematics(local, trans + tiny.REST[0], tiny.REST)
     tracked = list(TRACKED)
-    frames = motion_frames(poses, trans, tiny.REST).float()
+    frames = compute_motion_frames(poses, trans, tiny.REST).float()
     return Person(positions[:, tracked].numpy(), rotations[:, tracked].numpy(), frames)
 
 

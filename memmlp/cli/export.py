@@ -207,7 +207,7 @@ def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
     from memmlp.live.trackers_to_body_graph import measure_full_differences
 
     model, network = load(opened, form)
-    (clip,) = select_parity_clips(model, opened.data.open("test").clips())
+    (clip,) = select_parity_clips(model, opened.data.open("test").read_clips())
     announce(f"export: write {out}, and compare it with torch on a test clip")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
@@ -258,8 +258,8 @@ def write_lower(opened: OpenedRun, out: Path, form: ExportForm, max_growth: floa
     model, network = load(opened, form)
     if not isinstance(network, StreamingGraph):
         raise InputError(f"--precision {precision}: needs a streaming graph")
-    test = opened.data.open("test").clips()
-    train = opened.data.open("train").clips() if precision == "int8" else []
+    test = opened.data.open("test").read_clips()
+    train = opened.data.open("train").read_clips() if precision == "int8" else []
     announce(f"export: write {out} in {precision}, and measure its accuracy on the test clips")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         exact, other = Path(folder) / "fp32.onnx", Path(folder) / "other.onnx"

@@ -230,7 +230,7 @@ def load_tracked_clip(options: LiveOptions) -> TrackedClip:
 
     test = open_run(options.outputs, options.network).test
     index = 0 if options.clip is None else find_clip_index(test, options.clip)
-    return TrackedClip(test.names[index], test.clip(index).numpy())
+    return TrackedClip(test.names[index], test.read_clip(index).numpy())
 
 
 def serve(options: LiveOptions) -> None:

@@ -120,6 +120,6 @@ def predict_test_clip(
     if name not in test.names:
         known = ", ".join(test.names)
         raise InputError(f"SOURCE {name}: must be a file, a folder, or a test clip of the run: {known}")
-    (clip,) = predictor.predict([name], [test.clip(test.names.index(name))])
+    (clip,) = predictor.predict([name], [test.read_clip(test.names.index(name))])
     write_motion(out, clip, predictor.rest, chosen)
     return ExportReport((out,), len(clip) / FPS, ())

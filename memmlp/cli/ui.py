@@ -59,7 +59,7 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
 
     torch.set_num_threads(1)  # leaves the other threads to training processes
     experiment = build_run_experiment(run)
-    if experiment.motion.digest() is None:
+    if experiment.motion.find_digest() is None:
         raise InputError(f"run {run.id}: its data is not prepared here; prepare it with memmlp eval {run.id}")
     opened = OpenedRun(run, experiment, load_run_data(run, experiment))
     with torch.inference_mode():

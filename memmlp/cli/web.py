@@ -88,7 +88,7 @@ def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 
     test = opened.test
     chosen = np.linspace(0, len(test.names) - 1, min(count, len(test.names))).round().astype(int)
-    return [pack_clip(test.names[index], test.clip(index).numpy(), seconds) for index in chosen.tolist()]
+    return [pack_clip(test.names[index], test.read_clip(index).numpy(), seconds) for index in chosen.tolist()]
 
 
 def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:

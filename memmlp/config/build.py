@@ -26,7 +26,7 @@ from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import UserMetric
-from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.body import make_builtin_rest_joints
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
@@ -117,7 +117,9 @@ def build_untrained(overrides: Sequence[str]) -> MotionModel:
     architecture = build_architecture(compose_config(list(overrides)))
     torch.manual_seed(0)
     codes = architecture.vqvae() if architecture.uses_codes else None
-    normalizer = Normalizer.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
+    normalizer = Normalizer.from_coordinates(
+        architecture.coordinates, torch.as_tensor(make_builtin_rest_joints())
+    )
     return architecture.build(normalizer, codes).eval()
 
 

@@ -18,7 +18,7 @@ from memmlp.config import plugins
 from memmlp.motion.clip import LINES
 from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.cache import ClipFolder
-from memmlp.motion.preparing.find_clips import Folders, Root
+from memmlp.motion.preparing.find_clips import NamedFolders, Root
 from memmlp.motion.preparing.persons import Kind, PersonSplit
 from memmlp.motion.preparing.splits import ListSplit, MixedSplit, SeededSplit, Split, SubsetSplit
 from memmlp.runs.identity import flatten
@@ -95,13 +95,13 @@ def _build_clips(data: DictConfig) -> _Clips:
         keys["kinds"] = {name: Kind(**kind) for name, kind in keys["kinds"].items()}
     split: Any = SPLITS[keys.pop("name")](**keys)
     if sources := data.get("sources"):
-        folders = Folders({name: Path(source.root) for name, source in sources.items()})
+        folders = NamedFolders({name: Path(source.root) for name, source in sources.items()})
         own = {name: _build_source_split(split, name, source) for name, source in sources.items()}
         return _Clips(folders, MixedSplit(own))
     roots = list(data.root) if OmegaConf.is_list(data.root) else [data.root]
     if len(roots) == 1:
         return _Clips(Path(roots[0]), split)
-    folders = Folders.of([Path(root) for root in roots])
+    folders = NamedFolders.from_paths([Path(root) for root in roots])
     return _Clips(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
 
 

@@ -176,5 +176,5 @@ def _find_data_digest(request: RunRequest, prepare: bool, known: dict[str, str |
     """
     key = digest([request.config["data"], request.config["paths"]])
     if key not in known:
-        known[key] = request.motion.prepare().digest if prepare else request.motion.digest()
+        known[key] = request.motion.prepare().digest if prepare else request.motion.find_digest()
     return known[key]

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.overrides import parse_overrides
 from memmlp.config.build import build_experiment, load_config
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.motion_source import Prepared
+from memmlp.motion.motion_source import PreparedMotion
 from memmlp.networks.motion_model import MotionModel
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, select_training_config
 from memmlp.runs.lookup import find_run
@@ -33,7 +33,7 @@ class OpenedRun(NamedTuple):
 
     run: Run
     experiment: Experiment
-    data: Prepared
+    data: PreparedMotion
 
     @property
     def test(self) -> MotionDataset:
@@ -67,7 +67,7 @@ def open_existing_run(run: Run, device_name: str = "cpu", overrides: Sequence[st
     return OpenedRun(run, experiment, load_run_data(run, experiment))
 
 
-def load_run_data(run: Run, experiment: Experiment) -> Prepared:
+def load_run_data(run: Run, experiment: Experiment) -> PreparedMotion:
     """Return the prepared data of a run. Raises InputError if the data has changed since the training."""
     # Clips of the list may be missing, as long as the digest matches the training data.
     data = replace(experiment.motion, partial=True).prepare()
@@ -100,7 +100,7 @@ def load_network(run: Run, experiment: Experiment) -> MotionModel:
 
 def find_clip(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:
     """Return all frames (N, 252) of a test clip. Raises InputError for an unknown name."""
-    return test.clip(find_clip_index(test, name, key))
+    return test.read_clip(find_clip_index(test, name, key))
 
 
 def find_clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:

@@ -228,14 +228,14 @@ class NoConversion(Normalizer):
     def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         return motion
 
-    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+    def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
         return rotations
 
-    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+    def decode_rotations(self, rotation: Tensor, sparse: Tensor) -> Tensor:
         return F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
 
-    def posed_in_world(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
-        return self.posed(rotations, sparse)
+    def build_world_motion(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
+        return self.decode_rotations(rotations, sparse)
 
     def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
         return torch.zeros_like(motion[..., POSITION]).unflatten(-1, (N_JOINTS, 3))

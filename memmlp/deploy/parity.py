@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
-from memmlp.motion.geometry import one_thread
+from memmlp.motion.geometry import limit_to_one_thread
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import Blend
 
@@ -80,7 +80,7 @@ def measure_differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
     expected, found = stream_torch(model, clip), stream_onnx(OnnxStream(path), clip)
     if "position" not in model.branches:
         exact = copy.deepcopy(model.normalizer).double()
-        positions = exact.pose(found.double(), clip[:, :SPARSE_DIM].double())
+        positions = exact.compute_positions(found.double(), clip[:, :SPARSE_DIM].double())
         expected = torch.cat([expected[:, ROTATION], positions.flatten(1)], 1)
     return (expected - found).abs().amax(1)
 
@@ -104,7 +104,7 @@ def stream_torch(model: MotionModel, clip: Tensor) -> Tensor:
     It runs on one thread, because several threads are slower for such small computations.
     """
     state, motions = model.initial_state(1), []
-    with disable_sampling(model), one_thread():
+    with disable_sampling(model), limit_to_one_thread():
         for sparse in progress_bar(clip[:, None, None, :SPARSE_DIM], "check"):
             motion, state = model.advance(sparse, state)
             motions.append(motion[0, -1])

@@ -45,7 +45,7 @@ class Evaluation:
             True, only present if the network uses future frames.
         """
         torch.manual_seed(self.seed)  # each mode starts from the same seed
-        clips = test.clips()
+        clips = test.read_clips()
         rows: list[dict[str, Any]] = []
         for index, motion in enumerate(modes.predict(model, clips, mode, self.batch)):
             facts = {"name": test.names[index], "group": test.groups[index]}
@@ -63,8 +63,8 @@ def predict_first_clip(model: MotionModel, test: MotionDataset) -> tuple[np.ndar
     The mode is "window" for networks that use future frames, and "stream" for all others.
     """
     device = model.normalizer.rest.device
-    clip = test.clip(0)[:PICTURE_FRAMES].to(device)
+    clip = test.read_clip(0)[:PICTURE_FRAMES].to(device)
     motion = modes.MODE_FUNCTIONS["stream" if model.is_stream else "window"](model, [clip])[0]
-    predicted = model.normalizer.pose(motion, clip[:, :SPARSE_DIM])
+    predicted = model.normalizer.compute_positions(motion, clip[:, :SPARSE_DIM])
     truth = modes.extract_positions(clip[:, SPARSE_DIM:])
     return truth.cpu().numpy(), predicted.cpu().numpy()

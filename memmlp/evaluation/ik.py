@@ -100,7 +100,7 @@ class Arms:
         local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
         rotations, _ = forward_kinematics(local, torch.zeros_like(sparse[:, :3]), normalizer.rest)
         turned = use_tracker_rotations(matrix_to_sixd(rotations).flatten(1), sparse)
-        solved = normalizer.posed_in_world(turned, sparse, bend_arms_to_trackers)
+        solved = normalizer.build_world_motion(turned, sparse, bend_arms_to_trackers)
         return {"combined": torch.cat([solved[:, ROTATION], motion[:, POSITION]], -1)}
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, HANDS, LOWER, ROOT, UPPER
-from memmlp.motion.geometry import geodesic_angle, matrix_to_axis_angle
+from memmlp.motion.geometry import compute_geodesic_angle, matrix_to_axis_angle
 
 POSITION_GROUPS = {"Hand PE": HANDS, "Upper PE": UPPER, "Lower PE": LOWER, "Root PE": (ROOT,)}
 
@@ -33,7 +33,7 @@ def compute_mpjre(predicted: Tensor, truth: Tensor) -> Tensor:
 
 def compute_geodesic_error(predicted: Tensor, truth: Tensor) -> Tensor:
     """Return the mean angle between predicted and true local rotations of joints 1-21, in degrees."""
-    return torch.rad2deg(geodesic_angle(predicted[:, 1:], truth[:, 1:]).mean())
+    return torch.rad2deg(compute_geodesic_angle(predicted[:, 1:], truth[:, 1:]).mean())
 
 
 def compute_position_error(predicted: Tensor, truth: Tensor, joints: tuple[int, ...] | None = None) -> Tensor:

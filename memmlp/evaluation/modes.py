@@ -154,7 +154,7 @@ def measure_rotation_branch(
     """
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
     rotations = extract_rotations(motion), extract_rotations(target)
-    positions = normalizer.pose(motion, sparse), extract_positions(target)
+    positions = normalizer.compute_positions(motion, sparse), extract_positions(target)
     report = metrics.measure_rotations(*rotations) | metrics.measure_positions(*positions)
     report |= metrics.compute_custom_metrics(custom or {}, "rotations", *rotations)
     return report | metrics.compute_custom_metrics(custom or {}, "positions", *positions)
@@ -175,7 +175,7 @@ def cut_clips(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
 
     Pieces shorter than `least` frames are dropped, unless all pieces are shorter.
     """
-    pieces = [piece for clip in dataset.clips() for piece in clip.split(length)]
+    pieces = [piece for clip in dataset.read_clips() for piece in clip.split(length)]
     return [p for p in pieces if len(p) >= least] or pieces
 
 

@@ -18,9 +18,9 @@ from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import FPS, SPARSE_DIM
 from memmlp.motion.clip import SPLINES, Clip, resample
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.exporting import ExportPlan, ExportReport, Target, export_converted
+from memmlp.motion.exporting import ExportPlan, ExportReport, ExportTarget, convert_and_export
 from memmlp.motion.normalizer import Normalizer
-from memmlp.motion.preparing.cache import frame_blocks
+from memmlp.motion.preparing.cache import compute_frame_blocks
 from memmlp.networks.motion_model import MotionModel
 
 KINDS_OF_POSES = {"rotation": "predicted", "combined": "combined", "truth": "true"}
@@ -29,7 +29,7 @@ KINDS_OF_POSES = {"rotation": "predicted", "combined": "combined", "truth": "tru
 
 def save_predictions(evaluation: Evaluation, model: MotionModel, test: MotionDataset, folder: Path) -> None:
     """Write `<folder>/<mode>/<clip>.npz` for every mode and test clip; see `make_prediction_arrays`."""
-    clips = test.clips()
+    clips = test.read_clips()
     for mode in evaluation.modes:
         torch.manual_seed(evaluation.seed)  # the same seed as for the mode's metrics
         motions = modes.predict(model, clips, mode, evaluation.batch)
@@ -81,14 +81,14 @@ def make_prediction_arrays(
     """
     sparse, truth = clip[:, :SPARSE_DIM], clip[:, SPARSE_DIM:]
     arrays = {
-        "predicted_positions": normalizer.pose(motion, sparse),
+        "predicted_positions": normalizer.compute_positions(motion, sparse),
         "predicted_positions_of_position_branch": modes.extract_positions(motion),
         "true_positions": modes.extract_positions(truth),
         "predicted_rotations": modes.extract_rotations(motion),
         "true_rotations": modes.extract_rotations(truth),
     }
     for name, solved in ik.solutions(normalizer, motion, sparse).items():
-        arrays[f"{name}_positions"] = normalizer.pose(solved, sparse)
+        arrays[f"{name}_positions"] = normalizer.compute_positions(solved, sparse)
         arrays[f"{name}_rotations"] = modes.extract_rotations(solved)
     return {name: tensor.cpu().numpy() for name, tensor in arrays.items()}
 
@@ -165,11 +165,11 @@ class ClipPredictor:
             InputError: if every clip is unreadable, or a file cannot be written.
         """
         batch = self.evaluation.batch
-        return export_converted(
+        return convert_and_export(
             plan, self.rest, self._compute_frames, self.predict, batch=batch, strict=strict
         )
 
-    def _compute_frames(self, target: Target, clip: Clip) -> Tensor:
+    def _compute_frames(self, target: ExportTarget, clip: Clip) -> Tensor:
         """Compute the frames (N, 252) of a clip on the network's body, like in a cache.
 
         Raises:
@@ -178,4 +178,4 @@ class ClipPredictor:
         clip, _ = resample(clip, interpolation=self.interpolation)
         if len(clip) < 2:
             raise InputError(f"{target.source}: has one frame at {FPS} Hz; must have two or more")
-        return torch.from_numpy(np.concatenate(list(frame_blocks(clip, self.rest))))
+        return torch.from_numpy(np.concatenate(list(compute_frame_blocks(clip, self.rest))))

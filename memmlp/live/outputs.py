@@ -40,7 +40,7 @@ from memmlp.live.spaces import SPACES
 from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, N_JOINTS, PARENTS, ROOT
 from memmlp.motion.clip import Clip
-from memmlp.motion.exporting import format_of, write_motion
+from memmlp.motion.exporting import find_format, write_motion
 from memmlp.motion.formats.gltf import UNITY_BONES
 
 VMC_PORT, VRCHAT_PORT = 39539, 9000
@@ -246,7 +246,7 @@ class Recorder:
 
     def __init__(self, paths: Sequence[Path], rest: np.ndarray, fps: float, report: Callable[[str], None]):
         for path in paths:
-            format_of(path, "--record")
+            find_format(path, "--record")
             if path.exists():
                 raise InputError(f"--record {path}: already exists; must be a new file")
             try:
@@ -299,7 +299,7 @@ class Recorder:
 
     def _write(self, path: Path, rows: np.ndarray) -> None:
         """Write a file, and report its length, breaks and interpolated frames."""
-        chosen = format_of(path)
+        chosen = find_format(path)
         scale = self.scale if chosen.has_bones else 1.0
         rest = self.rest / scale
         poses = rows[:, :-3].reshape(-1, N_JOINTS, 3)

@@ -302,7 +302,7 @@ class Stream:
         from memmlp.motion.network_coordinates import World
         from memmlp.motion.normalizer import Normalizer
 
-        world = Normalizer.raw(World(), torch.tensor(self.network.body.rest))
+        world = Normalizer.from_coordinates(World(), torch.tensor(self.network.body.rest))
         motion = torch.from_numpy(
             np.concatenate([sixd.reshape(1, -1), self.network.position.reshape(1, -1)], 1)
         )

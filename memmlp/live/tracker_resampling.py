@@ -213,7 +213,7 @@ class TrackerFrames:
 
 
 class FeatureWriter:
-    """Computes the network's 54 inputs frame by frame, like `memmlp.motion.geometry.sparse_features`."""
+    """Computes the 54 network inputs frame by frame, like `motion.geometry.compute_sparse_features`."""
 
     def __init__(self) -> None:
         self.last: TrackerSample | None = None

@@ -47,7 +47,7 @@ from memmlp.motion.body import (
     SPARSE_ROTATION,
     SPARSE_VELOCITY,
 )
-from memmlp.motion.geometry import sixd_to_matrix, sparse_features
+from memmlp.motion.geometry import compute_sparse_features, sixd_to_matrix
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 
 INPUTS = ("tracker_positions", "tracker_rotations")
@@ -119,7 +119,7 @@ class FullStep(nn.Module):
         positions = positions @ self.world.T
         rotations = self.world @ rotations * self.body
         past = seen > 0
-        sparse = sparse_features(
+        sparse = compute_sparse_features(
             torch.cat([torch.where(past[..., None, None], last_rotations, rotations), rotations]),
             torch.cat([torch.where(past[..., None], last_positions, positions), positions]),
         )
@@ -204,10 +204,17 @@ def measure_full_differences(model: MotionModel, path: Path, clip: Tensor, space
     1, all differences are infinity.
     """
     positions, rotations = extract_trackers(clip[:, :SPARSE_DIM].cpu())
-    sparse, reference, stream = sparse_features(rotations, positions), find_space(space), OnnxStream(path)
+    sparse, reference, stream = (
+        compute_sparse_features(rotations, positions),
+        find_space(space),
+        OnnxStream(path),
+    )
     motion = stream_torch(model.cpu().eval(), sparse)
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
-    joints = [model.normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
+    joints = [
+        model.normalizer.compute_positions(motion, sparse),
+        motion[:, POSITION].unflatten(-1, (N_JOINTS, 3)),
+    ]
     expected = [
         reference.convert_pose_from_amass(local),
         *(reference.convert_positions_from_amass(part.numpy()) for part in joints),

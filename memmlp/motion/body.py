@@ -1,4 +1,4 @@
-"""The body and every convention of the project, stated once: joints, tree, feature layout.
+"""The conventions of all motion data: body joints, joint tree, feature layout and frames of reference.
 
 Frames of reference: motion lives in AMASS' world (Z up, metres). A rest pose lives in SMPL's body frame (Y
 up, the person faces +Z, left is +X, T-pose). The root's rotation turns it into the world. A
@@ -18,7 +18,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest
 
-FPS = 60  # frames per second of everything after `memmlp.motion.clip.resample`
+FPS = 60  # frames per second of all motion after `memmlp.motion.clip.resample`
 
 JOINTS = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",
@@ -75,8 +75,8 @@ _REST = {
 }
 
 
-def builtin_rest_joints() -> np.ndarray:
-    """Return the built-in adult's rest positions (22, 3), metres, SMPL's body frame, pelvis at 0."""
+def make_builtin_rest_joints() -> np.ndarray:
+    """Return the rest positions (22, 3) of the built-in adult: metres, SMPL's body frame, pelvis at 0."""
 
     def rest(name: str) -> tuple[float, float, float]:
         if name.startswith("right_"):
@@ -96,10 +96,10 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
         body: "builtin", or the path of an SMPL-H `model.npz`.
 
     Raises:
-        InputError: if the file is not such a model.
+        InputError: if the file is not an SMPL-H model.
     """
     if str(body) == "builtin":
-        return builtin_rest_joints()
+        return make_builtin_rest_joints()
     path = Path(body)
     if not path.is_file():
         raise InputError(f"data.body={path}: no such file; must be builtin, or an SMPL-H model.npz")
@@ -116,54 +116,54 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
     return joints[:N_JOINTS]
 
 
-def _other_side(name: str) -> str:
-    """Return the name of the joint that takes a joint's place in the mirror."""
+def _swap_side(name: str) -> str:
+    """Return the name of a joint after mirroring: left and right are exchanged."""
     side, _, rest = name.partition("_")
     return {"left": f"right_{rest}", "right": f"left_{rest}"}.get(side, name)
 
 
-SWAPPED = tuple(JOINTS.index(_other_side(name)) for name in JOINTS)
-"""The joints that take the joints' places in a mirror, as indices: left and right change places."""
+SWAPPED = tuple(JOINTS.index(_swap_side(name)) for name in JOINTS)
+"""The index of each joint's mirrored joint: left and right are exchanged."""
 
 
-# The body that clips were imported onto, with which they must be used: their feet stand at its floor
+# Imported clips can be used only with the body of their import: their height above the floor depends on it
 
 RECORD = "import.json"
-"""The record that an import leaves in its folder."""
+"""Name of the record file that an import writes into its folder."""
 
 
-def body_record(body: str, rest: np.ndarray) -> dict[str, Any]:
-    """Return the part of an import's record that describes its body.
+def describe_body(body: str, rest: np.ndarray) -> dict[str, Any]:
+    """Return the body's entries in an import record: its name and its rest joints.
 
     Args:
         body: `builtin`, or the path of an SMPL-H model.
-        rest: its rest joints (22, 3), metres.
+        rest: the body's rest joints (22, 3), metres.
     """
     return {"body": Path(body).name, "joints": rest.round(6).tolist()}
 
 
-def body_name(body: str, rest: np.ndarray) -> str:
-    """Return a body's name; a model's includes a digest, since all bodies' model files have the same name.
+def format_body_name(body: str, rest: np.ndarray) -> str:
+    """Return a body's name. A model's name includes a digest, because all model files have the same name.
 
     Args:
         body: `builtin`, or the path of an SMPL-H model.
-        rest: its rest joints (22, 3), metres.
+        rest: the body's rest joints (22, 3), metres.
     """
     return "builtin" if body == "builtin" else f"{Path(body).name} {digest(rest.tolist())[:8]}"
 
 
-def check_imported_body(clips: Iterable[Path], rest: np.ndarray, user: str) -> None:
-    """Check that clips which memmlp imported are used with the body that they were imported onto.
+def check_imported_body(clips: Iterable[Path], rest: np.ndarray, body_source: str) -> None:
+    """Check that imported clips are used with the body of their import.
 
-    On another body the floor lies elsewhere, by centimetres. Clips without a record of an import pass.
+    The floor height differs by centimetres between bodies. Clips without an import record pass.
 
     Args:
         clips: the clips' files.
         rest: the body's rest joints (22, 3), metres.
-        user: the key, option or network that gave the body, for the message.
+        body_source: the setting, option or network that selected the body, for the message.
 
     Raises:
-        InputError: if they were imported onto another body.
+        InputError: if the clips were imported for a different body.
     """
     folders = {clip.parent.resolve() for clip in clips}
     above = ([parent / RECORD for parent in (folder, *folder.parents)] for folder in folders)
@@ -172,10 +172,10 @@ def check_imported_body(clips: Iterable[Path], rest: np.ndarray, user: str) -> N
             record = json.loads(path.read_text("utf-8"))
             body, joints = record["body"], np.asarray(record["joints"], np.float64)
         except (OSError, ValueError, TypeError, KeyError):
-            continue  # a file of another program
+            continue  # written by another program
         # Networks have their joints in float32.
         if joints.shape != rest.shape or not np.allclose(joints, rest, rtol=0, atol=1e-4):
             raise InputError(
-                f"{path.parent}: imported onto the body {body}, but {user} has another one; "
-                "use the same body, or import again with --body"
+                f"{path.parent}: the clips were imported for the body {body}, but {body_source} is "
+                "different; use the same body, or import the clips again with --body"
             )

@@ -1,4 +1,4 @@
-"""Motion clips in memory: their resampling to 60 Hz, their frame rates, and their form in Y-up worlds."""
+"""Motion clips in memory: resampling to 60 Hz, usual frame rates, and conversion to Y-up worlds."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from memmlp.motion.body import FPS, N_JOINTS
 
 FRAME_RATE_RANGE = (1.0, 1000.0)
 INTERPOLATED = "interpolated"
-PIECE = 3600  # frames of a long clip that are worked on at a time
+PIECE = 3600  # maximum number of frames that are processed at a time
 SPLINES, LINES = "splines", "lines"
 INTERPOLATIONS = (SPLINES, LINES)
-"""How motion is interpolated at times that lie between two recorded frames.
+"""The methods of interpolation between two recorded frames.
 
-Splines are smooth, like motion. Lines have a kink at each recorded frame, and so a jerk that no body has:
-four times as much as there is in Bandai-Namco's motion at 30 Hz (docs/guides/motion.md).
+Splines are as smooth as human motion. Lines have a kink at each recorded frame. For Bandai-Namco's motion at
+30 Hz, that makes the jerk four times as large (docs/guides/motion.md).
 """
 RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame time of .0083333) is 120
 
 
 @dataclass(frozen=True)
-class Skipped:
+class SkippedFile:
     """A file that was skipped.
 
     Attributes:
         file: the file's path below the folder.
-        reason: why it was skipped, in one line.
+        reason: why the file was skipped, in one line.
     """
 
     file: str
@@ -42,7 +42,7 @@ class Clip:
 
     Attributes:
         name: path below the data root, `/`-separated, without suffix.
-        poses: axis-angle (N, 22, 3), radians: local rotations, the root's global.
+        poses: axis-angle (N, 22, 3), radians: local rotations; the root's rotation is global.
         trans: translation (N, 3), metres, world (Z up); the root joint is at rest[0] + trans.
         fps: frames per second.
     """
@@ -55,7 +55,7 @@ class Clip:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def pieces(self, frames: int = PIECE) -> Iterator[Clip]:
+    def split_into_pieces(self, frames: int = PIECE) -> Iterator[Clip]:
         """Yield the clip in successive pieces of at most `frames` frames."""
         for start in range(0, len(self), frames):
             piece = slice(start, start + frames)
@@ -63,19 +63,19 @@ class Clip:
 
 
 def resample(clip: Clip, fps: float = FPS, interpolation: str = SPLINES) -> tuple[Clip, str]:
-    """Resample a clip to exactly `fps`; also return the way: `kept`, `every k. frame`, or `interpolated`.
+    """Resample a clip to exactly `fps`, and return the method: `kept`, `every k. frame`, or `interpolated`.
 
-    If the clip's rate is a multiple of `fps`, every k-th frame is taken; otherwise poses and translation are
-    interpolated at the times k / fps that lie inside the clip.
+    If the clip's rate is a multiple of `fps`, every k-th frame is kept. Otherwise poses and translation are
+    interpolated at the times k / fps within the clip.
 
     Args:
         clip: the clip.
         fps: the new rate, Hz.
-        interpolation: SPLINES, with continuous accelerations of joints' rotations and of the translation, or
-            LINES, slerp and straight lines.
+        interpolation: SPLINES, which give continuous accelerations, or LINES: slerp for rotations and linear
+            interpolation for the translation.
 
     Raises:
-        InputError: if a clip of one frame would have to be interpolated.
+        InputError: if the clip needs interpolation but has only one frame.
     """
     ratio = clip.fps / fps
     stride = round(ratio)
@@ -83,7 +83,7 @@ def resample(clip: Clip, fps: float = FPS, interpolation: str = SPLINES) -> tupl
         method = "kept" if stride == 1 else f"every {stride}. frame"
         return replace(clip, poses=clip.poses[::stride], trans=clip.trans[::stride], fps=float(fps)), method
     if len(clip) < 2:
-        raise InputError(f"{clip.name}: one frame at {clip.fps:g} Hz cannot be brought to {fps:g} Hz")
+        raise InputError(f"{clip.name}: one frame at {clip.fps:g} Hz cannot be resampled to {fps:g} Hz")
     from scipy.spatial.transform import Rotation, RotationSpline, Slerp  # 0.4 s to import
 
     times = np.arange(len(clip)) / clip.fps
@@ -106,24 +106,27 @@ RARE_RATES = (20, 40, 80, 250, 360, 400, 480, 500)  # Hz; a rounded frame time i
 CLOSE = 2e-3  # relative: 29.97, 59.94 and 119.88 Hz are rates of video
 
 
-def nearest_rate(rate: float) -> float:
-    """Return the usual or rare rate that is nearest to a rate, relatively, Hz."""
+def find_nearest_rate(rate: float) -> float:
+    """Return the usual or rare rate with the smallest ratio to a rate, Hz."""
     return float(min(USUAL_RATES + RARE_RATES, key=lambda usual: max(usual / rate, rate / usual)))
 
 
 def is_known_rate(rate: float) -> bool:
-    """Return whether motion is usually recorded and kept at a rate, Hz; others may be mistakes."""
-    return abs(nearest_rate(rate) - rate) <= CLOSE * rate
+    """Return whether a rate, Hz, is a usual rate of motion data. Other rates may be mistakes."""
+    return abs(find_nearest_rate(rate) - rate) <= CLOSE * rate
 
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from AMASS' world: (x, y, z) becomes (x, z, -y)
 
 
-def y_up_motion(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return local rotations (N, 22, 3, 3), the root's global, and the root's positions (N, 3), metres.
+def convert_to_y_up(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Convert a clip to a right-handed world with Y up.
 
-    The world is right-handed with Y up, as SMPL's body frame is: where all rotations are the identity the
-    person stands in T-pose, upright, and faces +Z. A rest pose (22, 3), metres, needs no conversion.
+    If all rotations are the identity, the person stands upright in T-pose and faces +Z. The rest joints
+    (22, 3), metres, need no conversion, because SMPL's body frame has the same axes.
+
+    Returns:
+        Local rotations (N, 22, 3, 3), of which the root's is global, and the root's positions (N, 3), metres.
     """
     from scipy.spatial.transform import Rotation  # 0.4 s to import
 

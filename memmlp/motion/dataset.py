@@ -1,4 +1,4 @@
-"""A prepared cache as tensors: stretches for training, whole clips for evaluation, window sampler, mirror."""
+"""Prepared motion as tensors: windows for training, whole clips for evaluation, and mirrored clips."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FRAME_DIM, SWAPPED, TRACKED
-from memmlp.motion.preparing.find_clips import source_of
+from memmlp.motion.preparing.find_clips import get_source_name
 from memmlp.motion.preparing.manifest import PARTS, Manifest
 
 DRAWN_BY = ("frames", "clips")
@@ -20,16 +20,15 @@ SHARE_STEPS = 2**52  # resolution of the sources' shares
 
 
 class MotionDataset:
-    """All clips of one part, one after the other.
+    """All clips of one part (train, val or test), concatenated.
 
     Attributes:
         frames: [X | Theta] (F, 252), float32, world.
         starts: first frames of the clips (C,), int64, on the device of `frames`.
         lengths: numbers of frames of the clips (C,), int64, on the device of `frames`.
         names: names of the clips.
-        groups: group of each clip; clips that belong together share a group. By default each clip is a group
-            of its own.
-        sources: source of each clip; None for clips of one folder.
+        groups: group of each clip; dependent clips share a group. By default each clip has its own group.
+        sources: source of each clip; None if all clips are from one folder.
     """
 
     def __init__(
@@ -49,25 +48,25 @@ class MotionDataset:
         """Open a part (train, val, test) of a prepared cache, memory-mapped; `.to(device)` copies it.
 
         Raises:
-            InputError: if the cache is unfinished or damaged, or the part has no clip.
+            InputError: if the cache is unfinished or damaged, or the part has no clips.
         """
         if part not in PARTS:
             raise InputError(f"part={part}: must be one of {', '.join(PARTS)}")
         manifest = Manifest.load(cache)
         clips = manifest.part(part)
         if not clips:
-            raise InputError(f"{cache}: no {part} clips; prepare the data with a {part} part")
-        frames = _map(cache / f"{part}.npy")
+            raise InputError(f"{cache}: has no {part} clips; prepare the data with a {part} part")
+        frames = _map_array(cache / f"{part}.npy")
         if frames.shape != (sum(clip.length for clip in clips), FRAME_DIM):
-            raise InputError(f"{cache}: {part}.npy is not the manifest's array; prepare the data again")
+            raise InputError(f"{cache}: {part}.npy does not fit the manifest; prepare the data again")
         starts = torch.tensor([clip.start for clip in clips])
         lengths = torch.tensor([clip.length for clip in clips])
         names, groups = [clip.name for clip in clips], [clip.group for clip in clips]
-        sources = [source_of(name) for name in names] if manifest.sources else None
+        sources = [get_source_name(name) for name in names] if manifest.sources else None
         return cls(frames, starts, lengths, names, groups, sources)
 
     def to(self, device: torch.device | str) -> MotionDataset:
-        """Return the same dataset on a device."""
+        """Return a copy of the dataset on a device."""
         tensors = (self.frames.to(device), self.starts.to(device), self.lengths.to(device))
         return MotionDataset(*tensors, list(self.names), list(self.groups), self.sources)
 
@@ -75,14 +74,14 @@ class MotionDataset:
         """Return the number of clips."""
         return len(self.names)
 
-    def stretches(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
-        """Return the `length` frames of each clip up to and including frame `end`.
+    def read_stretches(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
+        """Read the last `length` frames of each clip up to and including frame `end`.
 
-        Before a clip's start its first frame repeats, as in the warm-up of a live stream.
+        Before the start of a clip its first frame is repeated, like in the warm-up of a live stream.
 
         Args:
             clip: indices of clips (B,).
-            end: frames of those clips (B,), 0 <= end < lengths[clip].
+            end: last frame in each of the clips (B,), 0 <= end < lengths[clip].
             length: number of frames.
 
         Returns:
@@ -93,34 +92,34 @@ class MotionDataset:
         frame = (end.to(device)[:, None] + back).clamp_min(0)
         return self.frames[self.starts[clip.to(device)][:, None] + frame]
 
-    def clip(self, index: int) -> Tensor:
+    def read_clip(self, index: int) -> Tensor:
         """Return all frames (N, 252) of a clip."""
         start, length = int(self.starts[index]), int(self.lengths[index])
         return self.frames[start : start + length]
 
-    def clips(self) -> list[Tensor]:
+    def read_clips(self) -> list[Tensor]:
         """Return all frames (N, 252) of each clip, without copying."""
-        return [self.clip(index) for index in range(len(self.names))]
+        return [self.read_clip(index) for index in range(len(self.names))]
 
 
 class WindowSampler:
-    """Draws random windows; a draw depends only on seed and step, so the step is the sampler's only state.
+    """Draws random windows of clips. A draw depends only on seed and step.
 
-    A window of a clip is named by its last frame. Every window can be drawn, including the clip's last one; a
-    clip shorter than the window has one window, which ends at its last frame.
+    A window is identified by its last frame. Every window can be drawn. A clip shorter than the window has
+    one window, which ends at the clip's last frame.
 
     Args:
         dataset: the clips.
         batch: number of windows per draw.
         window: number of frames per window.
         seed: seed of the draws.
-        drawn_by: "frames" if every window of the part is equally likely (reading 23), "clips" if every clip
-            is equally likely.
-        shares: how often a window is drawn from each source, relative to the others; within a source,
-            `drawn_by` decides. None draws from all clips.
+        drawn_by: "frames": all windows of the part are equally likely (docs/readings.md, no. 23). "clips":
+            all clips are equally likely.
+        shares: relative frequency of each source's windows; within a source, `drawn_by` applies. None
+            ignores sources.
 
     Raises:
-        InputError: for any other `drawn_by`.
+        InputError: for an invalid `drawn_by`.
     """
 
     def __init__(
@@ -139,24 +138,24 @@ class WindowSampler:
         self.first_end = np.minimum(window, lengths) - 1
         self.windows = np.maximum(lengths - window + 1, 1)
         weights = self.windows if drawn_by == "frames" else np.ones_like(self.windows)
-        self.weights = _shared(weights, dataset.sources, shares) if shares else weights
+        self.weights = _scale_weights(weights, dataset.sources, shares) if shares else weights
         self.bounds = np.cumsum(self.weights)
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
-        """Draw clips (B,) and the last frames (B,) of their windows, int64, on the dataset's device."""
+        """Draw clips (B,) and the last frame of a window in each (B,), int64, on the dataset's device."""
         random = np.random.Generator(np.random.Philox(key=[self.seed, step]))
         clip = np.searchsorted(self.bounds, random.integers(0, self.bounds[-1], self.batch), side="right")
         end = self.first_end[clip] + random.integers(0, self.windows[clip])
         return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
 
-    def draw_beginnings(self, step: int, stride: int) -> tuple[Tensor, Tensor]:
-        """Draw the starts of streams that run through a clip to its end, `stride` frames per step.
+    def draw_stream_starts(self, step: int, stride: int) -> tuple[Tensor, Tensor]:
+        """Draw the first windows of streams that run to the end of their clips, `stride` frames per step.
 
-        They begin at one of the clip's first windows. A clip in which a stream stays longer is drawn more
-        rarely, so that streams see each window as often as `draw` draws it.
+        Longer clips are drawn less often, because a stream takes longer to run through them. So all windows
+        are as frequent as with `draw`.
 
         Returns:
-            Clips (B,) and the last frames (B,) of the windows, as from `draw`, but independent of its draws.
+            Clips (B,) and the last frame of a window in each clip (B,), independent of the draws of `draw`.
         """
         random = np.random.Generator(np.random.Philox(key=[self.seed, step], counter=[0, 0, 1, 0]))
         bounds = np.cumsum(self.weights / np.maximum(self.windows / stride, 1))
@@ -165,26 +164,28 @@ class WindowSampler:
         return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
 
 
-def _shared(weights: np.ndarray, sources: Sequence[str] | None, shares: Mapping[str, float]) -> np.ndarray:
-    """Return clips' weights (C,), int64, scaled so that the weights of each source sum up to its share."""
+def _scale_weights(
+    weights: np.ndarray, sources: Sequence[str] | None, shares: Mapping[str, float]
+) -> np.ndarray:
+    """Scale the clips' weights: the weights of each source then sum to its share. Returns int64 (C,)."""
     named, scaled = np.array(sources), weights.astype(float)
     for source, share in shares.items():
         scaled[named == source] *= share / weights[named == source].sum()
     return np.rint(scaled / sum(shares.values()) * SHARE_STEPS).astype(np.int64)
 
 
-def _map(path: Path) -> Tensor:
-    """Open a memory-mapped .npy as a tensor, which must only be read."""
+def _map_array(path: Path) -> Tensor:
+    """Open a .npy file as a memory-mapped, read-only tensor."""
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a readable array ({error}); prepare the data again") from error
-    with warnings.catch_warnings():  # torch has no read-only tensors and says so
+        raise InputError(f"{path}: cannot be read as an array ({error}); prepare the data again") from error
+    with warnings.catch_warnings():  # torch warns that it has no read-only tensors
         warnings.simplefilter("ignore", UserWarning)
         return torch.from_numpy(array)
 
 
-# Motion seen in a mirror: left and right change places, as an augmentation of training data
+# Mirrored motion with left and right exchanged, which augments training data
 
 SIXD_SIGNS = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # the first two columns of S R S with S = diag(-1, 1, 1)
 POINT_SIGNS = (-1.0, 1.0, 1.0)  # S p
@@ -193,37 +194,37 @@ POINT_SIGNS = (-1.0, 1.0, 1.0)  # S p
 TRACKED_SWAPPED = tuple(TRACKED.index(SWAPPED[joint]) for joint in TRACKED)
 
 
-def _layout() -> tuple[Tensor, Tensor]:
-    """Return the source (252,) of each of a frame's features in the mirror, and its sign."""
+def _build_mirror_layout() -> tuple[Tensor, Tensor]:
+    """Return, for each feature of a mirrored frame (252,), the index of the original feature and its sign."""
     sources, signs = torch.arange(FRAME_DIM), torch.ones(FRAME_DIM)
     start = 0
-    for joints, of_each in (
+    for joints, joint_signs in (
         *((TRACKED_SWAPPED, part) for part in (SIXD_SIGNS, SIXD_SIGNS, POINT_SIGNS, POINT_SIGNS)),
         *((SWAPPED, part) for part in (SIXD_SIGNS, POINT_SIGNS)),
     ):
-        size = len(joints) * len(of_each)
+        size = len(joints) * len(joint_signs)
         block = torch.arange(start, start + size).view(len(joints), -1)
         sources[start : start + size] = block[list(joints)].flatten()
-        signs[start : start + size] = torch.tensor(of_each * len(joints))
+        signs[start : start + size] = torch.tensor(joint_signs * len(joints))
         start += size
     return sources, signs
 
 
-SOURCES, SIGNS = _layout()
+SOURCES, SIGNS = _build_mirror_layout()
 
 
 def mirror_frames(frames: Tensor) -> Tensor:
-    """Mirror world frames [X | Theta] (..., 252) at the plane X = 0, with left and right exchanged.
+    """Mirror world frames [X | Theta] (..., 252) at the plane X = 0, and exchange left and right joints.
 
-    If the body's rest pose is not symmetric, the mirrored motion belongs to the mirrored body.
+    If the rest pose is not symmetric, the mirrored motion is motion of the mirrored body.
     """
     return frames[..., SOURCES.to(frames.device)] * SIGNS.to(frames)
 
 
 class MirroredDataset(MotionDataset):
-    """Each clip of a dataset twice: first all clips as they are, then all clips mirrored.
+    """A dataset with all original clips, followed by a mirrored copy of each clip.
 
-    The frames are stored once; frames of a mirrored clip are mirrored when they are read.
+    The frames are stored once and mirrored when a mirrored clip is read.
     """
 
     def __init__(self, plain: MotionDataset):
@@ -232,13 +233,13 @@ class MirroredDataset(MotionDataset):
         starts, lengths = plain.starts.repeat(2), plain.lengths.repeat(2)
         super().__init__(plain.frames, starts, lengths, names, [*plain.groups] * 2, sources)
 
-    def stretches(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
-        """Return frames (B, length, 252) that end with frame `end` of each clip; see MotionDataset."""
-        plain = super().stretches(clip, end, length)
+    def read_stretches(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
+        """Read frames (B, length, 252) that end with frame `end` of each clip; see MotionDataset."""
+        plain = super().read_stretches(clip, end, length)
         turned = (clip >= len(self) // 2).to(plain.device)
         return torch.where(turned[:, None, None], mirror_frames(plain), plain)
 
-    def clip(self, index: int) -> Tensor:
+    def read_clip(self, index: int) -> Tensor:
         """Return all frames (N, 252) of a clip."""
-        plain = super().clip(index)
+        plain = super().read_clip(index)
         return mirror_frames(plain) if index >= len(self) // 2 else plain

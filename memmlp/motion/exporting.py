@@ -14,23 +14,23 @@ import numpy as np
 from memmlp.common.errors import InputError, escape_line_breaks
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import check_imported_body, load_rest_joints
-from memmlp.motion.clip import Clip, Skipped, resample
+from memmlp.motion.clip import Clip, SkippedFile, resample
 from memmlp.motion.formats.bvh import write_bvh
 from memmlp.motion.formats.gltf import write_gltf
-from memmlp.motion.formats.npz import NoMotion, read_clip, write_clip
+from memmlp.motion.formats.npz import NoMotionError, read_clip, write_clip
 from memmlp.motion.plausibility import check_plausible
-from memmlp.motion.preparing.find_clips import clip_name, find_clips
+from memmlp.motion.preparing.find_clips import find_clips, get_clip_name
 
 T = TypeVar("T")
 
 
 class Format(NamedTuple):
-    """A format that clips are written in.
+    """A file format for exported clips.
 
     Attributes:
-        suffix: the suffix of the format's files.
-        write: writes a clip on a body with rest joints (22, 3), metres, atomically.
-        has_bones: whether the file contains the body; readers of AMASS' npz supply it.
+        suffix: the file name suffix.
+        write: function that writes a clip atomically; its last argument is the rest joints (22, 3), metres.
+        has_bones: whether files contain the body's bones.
     """
 
     suffix: str
@@ -46,36 +46,40 @@ FORMATS = {
 SUFFIXES = {each.suffix: each for each in FORMATS.values()}
 
 
-def format_of(path: Path, key: str = "path") -> Format:
-    """Return the format that belongs to a file's suffix.
+def find_format(path: Path, key: str = "path") -> Format:
+    """Find the format for a file's suffix.
+
+    Args:
+        path: the file.
+        key: the option or argument that gave the path, for the message.
 
     Raises:
-        InputError: for any other suffix; its message names the path by `key`, the option or argument.
+        InputError: if no format has this suffix.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{key} {path}: the suffix must be one of {', '.join(SUFFIXES)}")
     return SUFFIXES[path.suffix.lower()]
 
 
-def write_motion(path: Path, clip: Clip, rest: np.ndarray, chosen: Format) -> None:
-    """Write a clip in a format, atomically; missing folders are made.
+def write_motion(path: Path, clip: Clip, rest: np.ndarray, target_format: Format) -> None:
+    """Write a clip in a format, atomically. Missing folders are created.
 
     Raises:
-        InputError: if the file cannot be written there.
+        InputError: if the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        chosen.write(path, clip, rest)
+        target_format.write(path, clip, rest)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 @dataclass(frozen=True)
-class Target:
+class ExportTarget:
     """A clip to be written.
 
     Attributes:
-        name: the clip's name: its path below the source folder, without suffix.
+        name: the clip's name, which is its path below the source folder without suffix.
         source: the clip's npz file.
         path: the file to write.
     """
@@ -95,75 +99,84 @@ class ExportPlan:
         skipped: folders that cannot be listed.
     """
 
-    targets: tuple[Target, ...]
+    targets: tuple[ExportTarget, ...]
     format: Format
-    skipped: tuple[Skipped, ...] = ()
+    skipped: tuple[SkippedFile, ...] = ()
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """The result of an export.
+    """The report of an export.
 
     Attributes:
         written: the files that were written.
         seconds: the total duration of the written clips.
         skipped: the clips that were skipped.
-        unusual: clip -> its faults, though it may be sound.
+        unusual: clip -> its likely mistakes.
     """
 
     written: tuple[Path, ...]
     seconds: float
-    skipped: tuple[Skipped, ...]
+    skipped: tuple[SkippedFile, ...]
     unusual: Mapping[str, str] = field(default_factory=dict)
 
 
 def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
-    """Plan the export of an npz file to the file `out`, or of a folder's npz files to the folder `out`.
+    """Plan the export of one npz file to the file `out`, or of a folder of npz files to the folder `out`.
 
     Args:
         source: file or folder.
-        out: file or folder; in a folder each file has its source's path, with the format's suffix.
-        name: the format, one of FORMATS; by default a file's suffix decides.
+        out: file or folder. In a folder, each file has the same relative path as its source.
+        name: the format, one of FORMATS; None chooses it by the suffix of `out`.
 
     Raises:
-        InputError: if there is nothing to export, the format is unclear, `out` is a file instead of a folder
-            or the reverse, or a source would be overwritten.
+        InputError: if there is nothing to export, the format is unknown, `out` is a file instead of a folder
+            or vice versa, or a source would be overwritten.
     """
     if not source.exists():
-        raise InputError(f"{source}: no such file or folder; expected an npz file, or a folder of npz files")
+        raise InputError(f"{source}: no such file or folder; expected an npz file or a folder of npz files")
     target_format = choose_format(out, name, folder=source.is_dir())
     if not source.is_dir():
         if out.resolve() == source.resolve():
-            raise InputError(f"--out {out}: must not be the source itself")
-        return ExportPlan((Target(source.stem, source, out),), target_format)
+            raise InputError(f"--out {out}: must differ from the source file")
+        return ExportPlan((ExportTarget(source.stem, source, out),), target_format)
     above, below = source.resolve(), out.resolve()
     if below.is_relative_to(above) or above.is_relative_to(below):
-        raise InputError(f"--out {out}: must not be in {source}, or around it; expected a folder beside it")
+        raise InputError(f"--out {out}: must be neither inside nor above {source}; choose a separate folder")
     content = find_clips(source)
-    names = {file: clip_name(file) for file in content.files}
+    names = {file: get_clip_name(file) for file in content.files}
     first, count = Counter(names.values()).most_common(1)[0]
     if count > 1:
-        raise InputError(f"{source / first}: {count} npz files with this name; expected one")
-    targets = tuple(Target(n, source / file, out / (n + target_format.suffix)) for file, n in names.items())
-    return ExportPlan(targets, target_format, tuple(Skipped(*each) for each in content.unreadable.items()))
+        raise InputError(f"{source / first}: {count} npz files have this name; expected one")
+    targets = tuple(
+        ExportTarget(n, source / file, out / (n + target_format.suffix)) for file, n in names.items()
+    )
+    return ExportPlan(
+        targets, target_format, tuple(SkippedFile(*each) for each in content.unreadable.items())
+    )
 
 
 def choose_format(out: Path, name: str | None, folder: bool) -> Format:
-    """Return the format of the file, or the folder of files, `out`: the named format, or its suffix's.
+    """Choose the format for `out`: the named format, or else the format of its suffix.
+
+    Args:
+        out: the file, or the folder for several files.
+        name: name of a format, or None.
+        folder: whether `out` must be a folder.
 
     Raises:
-        InputError: if neither determines the format, they contradict each other, a folder has a file's
-            suffix, or a file is a folder.
+        InputError: if the format is unknown, name and suffix contradict each other, or `out` is a file
+            instead of a folder or vice versa.
     """
     if folder and name is None:
-        raise InputError(f"--format: needed for a folder; must be one of {', '.join(FORMATS)}")
+        raise InputError(f"--format: required for a folder; must be one of {', '.join(FORMATS)}")
     if folder and (out.is_file() or out.suffix.lower() in SUFFIXES):
         raise InputError(f"--out {out}: must be a folder for several clips, not a file")
     if not folder and out.is_dir():
         raise InputError(f"--out {out}: must be a file for one clip, not a folder")
     if folder:
         return FORMATS[str(name)]
-    suffix_format = format_of(out, "--out")
+    suffix_format = find_format(out, "--out")
     if name is not None and FORMATS[name] is not suffix_format:
         raise InputError(f"--out {out}: the suffix must be {FORMATS[name].suffix} for --format {name}")
     return suffix_format
@@ -176,50 +189,52 @@ def export(
 
     Args:
         plan: the clips to write.
-        body: `builtin`, or an SMPL-H model.npz; it gives the bones in formats that have bones.
-        fps: frame rate, Hz, to which the clips are resampled; by default each keeps its own.
-        strict: whether a bad file raises; otherwise it is skipped and reported, if there are other files.
+        body: `builtin`, or an SMPL-H model.npz. It determines the bones in formats that have bones.
+        fps: frame rate, Hz, to which the clips are resampled; None keeps each clip's rate.
+        strict: whether a bad file raises an error. Otherwise it is skipped and reported, unless it is the
+            only file.
 
     Raises:
-        InputError: for a bad body, or one that the clips were not imported onto where the format has bones;
-            if no clip could be read, or a file cannot be written.
+        InputError: for an invalid body, or a body that differs from the body of the clips' import; if no clip
+            could be read, or a file cannot be written.
     """
     rest = load_rest_joints(body)
     if plan.format.has_bones:
         check_imported_body([target.source for target in plan.targets], rest, f"--body {body}")
 
-    def at_rate(target: Target, clip: Clip) -> Clip:
+    def resample_clip(target: ExportTarget, clip: Clip) -> Clip:
         return clip if fps is None else resample(clip, fps)[0]
 
-    return export_converted(plan, rest, at_rate, lambda names, clips: clips, strict=strict)
+    return convert_and_export(plan, rest, resample_clip, lambda names, clips: clips, strict=strict)
 
 
-def export_converted(
+def convert_and_export(
     plan: ExportPlan,
     rest: np.ndarray,
-    prepare: Callable[[Target, Clip], T],
+    prepare: Callable[[ExportTarget, Clip], T],
     finish: Callable[[Sequence[str], Sequence[T]], Sequence[Clip]],
     *,
     batch: int = 1,
     strict: bool = False,
 ) -> ExportReport:
-    """Convert a plan's clips and write them on a body, while a progress bar counts them.
+    """Convert a plan's clips and write them, with a progress bar.
 
     Args:
         plan: the clips to write.
         rest: the body's rest joints (22, 3), metres.
-        prepare: the first half of the conversion, clip by clip; may raise InputError.
-        finish: the other half, of up to `batch` clips at a time, given their names.
-        batch: number of clips that are finished together.
-        strict: whether a bad file raises; otherwise it is skipped and reported, if there are other files.
+        prepare: first step of the conversion, for one clip; may raise InputError.
+        finish: second step, for up to `batch` clips: names and prepared clips -> converted clips.
+        batch: maximum number of clips per call of `finish`.
+        strict: whether a bad file raises an error. Otherwise it is skipped and reported, unless it is the
+            only file.
 
     Raises:
-        InputError: for a bad file as described above, if no clip could be read, or a file cannot be written.
+        InputError: for a bad file (see `strict`), if no clip could be read, or if a file cannot be written.
     """
     skipped, faults = list(plan.skipped), dict[str, str]()
     written, seconds = list[Path](), 0.0
 
-    def read() -> Iterator[tuple[Target, T]]:
+    def read() -> Iterator[tuple[ExportTarget, T]]:
         single = len(plan.targets) == 1
         for target in progress_bar(plan.targets, "export"):
             try:
@@ -227,11 +242,11 @@ def export_converted(
                 clip_faults = check_plausible(target.source, clip)
                 content = prepare(target, clip)
             except InputError as error:
-                no_motion = isinstance(error, NoMotion)  # AMASS has files of shapes beside its clips
+                no_motion = isinstance(error, NoMotionError)  # AMASS folders also contain shape files
                 if single or (strict and not no_motion):
                     raise
                 reason = str(error).removeprefix(escape_line_breaks(f"{target.source}: "))
-                skipped.extend([] if no_motion else [Skipped(target.name + target.source.suffix, reason)])
+                skipped.extend([] if no_motion else [SkippedFile(target.name + target.source.suffix, reason)])
                 continue
             faults.update({target.name: clip_faults} if clip_faults else {})
             yield target, content

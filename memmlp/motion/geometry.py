@@ -1,8 +1,7 @@
-"""Rotations, forward kinematics, and the frames [X | Theta] of motion, on torch tensors.
+"""Rotations, forward kinematics, and the motion frames [X | Theta], with torch tensors.
 
-Rotations may have any leading shape and floating type. A rotation matrix acts on column vectors. "6D" is its
-first two columns, one after the other (Zhou et al. 2019, in the order that every code base of the field
-uses). Angles are radians.
+Rotations may have any leading shape and floating type. A rotation matrix acts on column vectors. "6D" is the
+matrix's first column followed by its second column (Zhou et al. 2019). Angles are in radians.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
 
 def matrix_to_wxyz(matrix: Tensor) -> Tensor:
-    """Convert matrices (..., 3, 3) to unit quaternions (..., 4), the real part first and not negative."""
+    """Convert matrices (..., 3, 3) to unit quaternions (..., 4) in the order wxyz, with w >= 0."""
     m = matrix
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    # Four forms of the same quaternion (scaled); the one with the largest pivot is well conditioned.
+    # Four scaled forms of the same quaternion; the form with the largest pivot is well conditioned.
     pivots = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz]
     ww, xx, yy, zz = pivots
     rows = [ww, wx, wy, wz], [wx, xx, xy, xz], [wy, xy, yy, yz], [wz, xz, yz, zz]
@@ -56,7 +55,7 @@ def matrix_to_wxyz(matrix: Tensor) -> Tensor:
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
     """Convert matrices (..., 3, 3) to axis-angle (..., 3) of norm at most pi.
 
-    The conversion goes through a quaternion, which is accurate at 0 and near pi.
+    It is accurate at 0 and near pi, because it goes through a quaternion.
     """
     quaternion = matrix_to_wxyz(matrix)
     vector = quaternion[..., 1:]
@@ -82,7 +81,7 @@ def sixd_to_matrix(sixd: Tensor) -> Tensor:
     return torch.stack([first, second, torch.linalg.cross(first, second, dim=-1)], -1)
 
 
-def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
+def compute_geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
     """Return the angle (...) in [0, pi] between rotations (..., 3, 3); accurate at 0 and at pi."""
     relative = a.transpose(-1, -2) @ b
     skew = torch.stack(
@@ -100,14 +99,14 @@ def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
 def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     """Return the joints' global rotations (..., 22, 3, 3) and positions (..., 22, 3).
 
-    Joints that are equally far from the root are computed together, which takes the fewest operations.
+    Joints at the same depth of the tree are computed together, which is fast.
 
     Args:
-        local: local rotations (..., 22, 3, 3), except for the root's, which is global.
+        local: local rotations (..., 22, 3, 3); the root's rotation is global.
         root: position of the root joint (..., 3), metres, world.
         rest: rest positions (22, 3), metres; only the offsets between joint and parent matter.
     """
-    offsets = (rest - rest[list(PARENTS)])[..., None]  # the root's is not used
+    offsets = (rest - rest[list(PARENTS)])[..., None]  # the root's offset is not used
     rotations, positions = [local[..., :1, :, :]], [root[..., None, :, None]]
     for joints, parents in LEVELS:
         above = _take_rows(rotations[-1], parents)
@@ -116,10 +115,10 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
     return torch.cat(rotations, -3), torch.cat(positions, -3)[..., 0]
 
 
-def bone_chains() -> Tensor:
-    """Return the matrix (22, 21) that adds turned bones up to joint positions relative to the head.
+def build_bone_chains() -> Tensor:
+    """Build the matrix (22, 21) that sums rotated bones to joint positions relative to the head.
 
-    A bone leads from a joint's parent to the joint; the root does not have one.
+    Each joint except the root has a bone, which leads from its parent to the joint.
     """
     chains = torch.zeros(N_JOINTS, N_JOINTS - 1)
     for joint in range(1, N_JOINTS):
@@ -129,7 +128,7 @@ def bone_chains() -> Tensor:
 
 
 def _take_rows(values: Tensor, runs: list[slice]) -> Tensor:
-    """Return the rows of values (..., n, a, b) that lie in runs, one run after the other."""
+    """Return the rows of values (..., n, a, b) within several slices, concatenated."""
     if runs == [slice(0, values.shape[-3])]:
         return values
     parts = [values[..., run, :, :] for run in runs]
@@ -148,11 +147,11 @@ LEVELS: tuple[tuple[slice, list[slice]], ...] = (
     (slice(18, 20), [slice(1, 3)]),
     (slice(20, 22), [slice(0, 2)]),
 )
-"""The joints level by level, equally far from the root, and their parents: runs in the level before."""
+"""For each depth of the tree: its joints, and their parents as slices of the previous depth's joints."""
 
 
-def clip_kinematics(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return global rotations (N, 22, 3, 3) and positions (N, 22, 3), metres, world, of a clip on a body.
+def compute_clip_kinematics(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute a clip's global rotations (N, 22, 3, 3) and positions (N, 22, 3), metres, world.
 
     Args:
         clip: the motion.
@@ -164,15 +163,15 @@ def clip_kinematics(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return rotations.numpy(), positions.numpy()
 
 
-def sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
-    """Compute the inputs X of three trackers (AvatarPoser's features, Sec. 3.1 of the paper).
+def compute_sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
+    """Compute the network inputs X from three trackers (AvatarPoser's features, Sec. 3.1 of the paper).
 
     Args:
         rotations: global rotations of head, left and right wrist (N, 3, 3, 3).
-        positions: their global positions (N, 3, 3), metres.
+        positions: global positions of the same joints (N, 3, 3), metres.
 
     Returns:
-        (N - 1, 54), feature-major as `memmlp.motion.body.SPARSE_*`. Frame 0 has no velocity and is dropped.
+        (N - 1, 54), with the layout of `memmlp.motion.body.SPARSE_*`. Frame 0 has no velocity and is dropped.
     """
     angular = rotations[:-1].transpose(-1, -2) @ rotations[1:]
     parts = [
@@ -184,25 +183,25 @@ def sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
     return torch.cat([part.flatten(1) for part in parts], 1)
 
 
-def motion_frames(poses: Tensor, trans: Tensor, rest: Tensor) -> Tensor:
-    """Compute the frames [X | Theta] (N - 1, 252) of a clip, world.
+def compute_motion_frames(poses: Tensor, trans: Tensor, rest: Tensor) -> Tensor:
+    """Compute a clip's frames [X | Theta] (N - 1, 252), world.
 
     Args:
-        poses: axis-angle (N, 22, 3), the root's global.
+        poses: axis-angle (N, 22, 3): local rotations; the root's rotation is global.
         trans: translation (N, 3), metres; the root joint is at rest[0] + trans.
         rest: rest positions (22, 3), metres.
     """
     local = axis_angle_to_matrix(poses)
     rotations, positions = forward_kinematics(local, trans + rest[0], rest)
     tracked = list(TRACKED)
-    sparse = sparse_features(rotations[:, tracked], positions[:, tracked])
+    sparse = compute_sparse_features(rotations[:, tracked], positions[:, tracked])
     theta = torch.cat([matrix_to_sixd(local).flatten(1), positions.flatten(1)], 1)
     return torch.cat([sparse, theta[1:]], 1)
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Limit torch to one thread: on short clips, more threads would only wait for one another."""
+def limit_to_one_thread() -> Iterator[None]:
+    """Limit torch to one thread within the context: for short clips, more threads are slower."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

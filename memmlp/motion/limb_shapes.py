@@ -1,4 +1,4 @@
-"""The round limbs that display joints: in pictures, on the live page, and in glTF files."""
+"""The round limbs that show a body in pictures, on the live page, and in glTF files."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ RADII = tuple(_RADII[name.split("_")[-1]] for name in JOINTS)
 """The body's radius at each joint, metres."""
 
 HEAT = ("#2b5fd9", "#27a9e1", "#3fc380", "#f2d43d", "#f28c28", "#c4161c")
-"""The colours of a limb from no error to the top of the colour scale, evenly spaced."""
+"""The colour scale for joint errors, from zero to the maximum, evenly spaced."""
 
 
 class Limb(NamedTuple):
-    """A round limb between two joints, or from a joint to a tip.
+    """A round limb from one joint to another, or from a joint to a tip.
 
     Attributes:
-        start, end: the joints whose errors colour its two ends.
-        radii: the radii at its ends, metres.
-        tip: 0 for a limb between the two joints. Otherwise the limb begins at `end`, and goes this many
-            metres further in the direction from `start` to `end`.
+        start, end: the joints that determine the colours of its two ends.
+        radii: the radii at its two ends, metres.
+        tip: 0 for a limb between the two joints. Otherwise the limb begins at `end`, and extends by this
+            length, metres, in the direction from `start` to `end`.
     """
 
     start: int
@@ -36,7 +36,7 @@ class Limb(NamedTuple):
     tip: float = 0.0
 
     @property
-    def first(self) -> int:
+    def first_joint(self) -> int:
         """The joint where the limb begins."""
         return self.end if self.tip else self.start
 
@@ -48,8 +48,8 @@ LIMBS = (
 )
 
 
-def ends(limb: Limb, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the two ends of a limb, each (3,), metres, given the joints (22, 3)."""
+def find_limb_ends(limb: Limb, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions of a limb's two ends, each (3,), metres, for the joint positions (22, 3)."""
     start, end = joints[limb.start], joints[limb.end]
     if not limb.tip:
         return start, end

@@ -1,4 +1,4 @@
-"""The coordinates slot: the local coordinates in which a network sees the world."""
+"""The component slot `coordinates`: the local coordinates of a network's inputs and outputs."""
 
 from __future__ import annotations
 
@@ -20,44 +20,47 @@ from memmlp.motion.body import (
 
 
 class Coordinates:
-    """The slot's interface; methods that are not overridden use the world's own coordinates.
+    """The slot's interface. Methods that are not overridden use world coordinates.
 
-    `origin` computes the origin of a frame's local coordinates from its inputs; `sparse_in`, `motion_in`
-    and `motion_out` convert inputs and motion to and from them.
+    Each frame has its own local coordinates. `find_origin` computes their origin from the frame's inputs; the
+    other methods convert inputs, motion and rotations.
     """
 
-    def origin(self, sparse: Tensor) -> Tensor:
-        """Return the origin (..., 3), metres, of the local coordinates of inputs (..., 54): here zeros."""
+    def find_origin(self, sparse: Tensor) -> Tensor:
+        """Return the origin (..., 3), metres, of local coordinates for inputs (..., 54). Default: zeros."""
         return torch.zeros_like(sparse[..., :3])
 
-    def sparse_in(self, sparse: Tensor, origin: Tensor) -> Tensor:
+    def convert_inputs_to_local(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """Convert world inputs (..., 54) to local coordinates."""
-        position = sparse[..., SPARSE_POSITION] - _tile(origin, len(TRACKED))
+        position = sparse[..., SPARSE_POSITION] - _repeat_point(origin, len(TRACKED))
         return torch.cat([sparse[..., : SPARSE_POSITION.start], position, sparse[..., SPARSE_VELOCITY]], -1)
 
-    def motion_in(self, motion: Tensor, origin: Tensor) -> Tensor:
+    def convert_motion_to_local(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert world motion (..., 198) to local coordinates."""
-        return torch.cat([motion[..., ROTATION], motion[..., POSITION] - _tile(origin, N_JOINTS)], -1)
+        return torch.cat([motion[..., ROTATION], motion[..., POSITION] - _repeat_point(origin, N_JOINTS)], -1)
 
-    def motion_out(self, motion: Tensor, origin: Tensor) -> Tensor:
+    def convert_motion_to_world(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert local motion (..., 198) to the world."""
-        return torch.cat([motion[..., ROTATION], motion[..., POSITION] + _tile(origin, N_JOINTS)], -1)
+        return torch.cat([motion[..., ROTATION], motion[..., POSITION] + _repeat_point(origin, N_JOINTS)], -1)
 
-    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+    def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
         """Convert joints' global rotations (..., 6 n), 6D, from local coordinates to the world."""
         return rotations
 
 
 @component("coordinates", "world")
 class World(Coordinates):
-    """The world's own coordinates: the most literal reading of the paper."""
+    """World coordinates: the most literal interpretation of the paper."""
 
 
 @component("coordinates", "head_relative")
 class HeadRelative(Coordinates):
-    """Coordinates with the head of the same frame as horizontal origin and unchanged heights (reading 20)."""
+    """Coordinates relative to the head's position on the floor in the same frame (docs/readings.md, no. 20).
 
-    def origin(self, sparse: Tensor) -> Tensor:
+    Heights stay unchanged.
+    """
+
+    def find_origin(self, sparse: Tensor) -> Tensor:
         """Return the head's position on the floor (..., 3), metres, for inputs (..., 54)."""
         head = sparse[..., SPARSE_POSITION][..., :3]
         return head * head.new_tensor([1.0, 1.0, 0.0])
@@ -65,58 +68,60 @@ class HeadRelative(Coordinates):
 
 @component("coordinates", "heading")
 class Heading(HeadRelative):
-    """Coordinates relative to the head on the floor, turned so that the head of the same frame faces ahead.
+    """Coordinates relative to the head's position on the floor and its heading in the same frame.
 
-    They are not in the paper. They remove the heading, because the motion does not depend on it. The head's
-    angular velocity is local already and stays. The heading is the twist of the head's rotation about the
-    vertical, which is defined unless the head is upside down.
+    They are not in the paper. They remove the heading, because the motion does not depend on it. The angular
+    velocities are local already and stay unchanged. The heading is the twist of the head's rotation about the
+    vertical. It is undefined only if the head is upside down.
     """
 
-    def origin(self, sparse: Tensor) -> Tensor:
-        """Return the head's position on the floor, metres, and its heading's cosine and sine (..., 5)."""
+    def find_origin(self, sparse: Tensor) -> Tensor:
+        """Return (..., 5): the head's position on the floor, metres, and its heading's cosine and sine."""
         # The rest pose has Y up and faces Z. Of the head's rotation R, whose first columns are a and b,
-        # A = R Rx(-90 deg) is the rotation from upright. Its twist is atan2(A10 - A01, A00 + A11): both are
-        # the level part of a, plus that of a x b turned by a right angle.
+        # A = R Rx(-90 deg) is the rotation from upright. Its twist is atan2(A10 - A01, A00 + A11). Both
+        # arguments are the horizontal part of a plus the horizontal part of a x b, rotated by 90 degrees.
         a, a_up, b, b_up = sparse[..., :6].split([2, 1, 2, 1], -1)
         heading = F.normalize(a + (a * b_up - a_up * b), dim=-1)
-        return torch.cat([super().origin(sparse), heading], -1)
+        return torch.cat([super().find_origin(sparse), heading], -1)
 
-    def sparse_in(self, sparse: Tensor, origin: Tensor) -> Tensor:
+    def convert_inputs_to_local(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """Convert world inputs (..., 54) to local coordinates."""
-        sparse = super().sparse_in(sparse, origin[..., :3])
-        turned = [
-            _turn(sparse[..., SPARSE_ROTATION], origin, -1),
+        sparse = super().convert_inputs_to_local(sparse, origin[..., :3])
+        rotated = [
+            _turn_vectors(sparse[..., SPARSE_ROTATION], origin, -1),
             sparse[..., SPARSE_ANGULAR_VELOCITY],
-            _turn(sparse[..., SPARSE_POSITION], origin, -1),
-            _turn(sparse[..., SPARSE_VELOCITY], origin, -1),
+            _turn_vectors(sparse[..., SPARSE_POSITION], origin, -1),
+            _turn_vectors(sparse[..., SPARSE_VELOCITY], origin, -1),
         ]
-        return torch.cat(turned, -1)
+        return torch.cat(rotated, -1)
 
-    def motion_in(self, motion: Tensor, origin: Tensor) -> Tensor:
+    def convert_motion_to_local(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert world motion (..., 198) to local coordinates."""
-        return self._turned(super().motion_in(motion, origin[..., :3]), origin, -1)
+        return self._turn_motion(super().convert_motion_to_local(motion, origin[..., :3]), origin, -1)
 
-    def motion_out(self, motion: Tensor, origin: Tensor) -> Tensor:
+    def convert_motion_to_world(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert local motion (..., 198) to the world."""
-        return super().motion_out(self._turned(motion, origin, 1), origin[..., :3])
+        return super().convert_motion_to_world(self._turn_motion(motion, origin, 1), origin[..., :3])
 
-    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+    def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
         """Convert joints' global rotations (..., 6 n), 6D, from local coordinates to the world."""
-        return _turn(rotations, origin, 1)
+        return _turn_vectors(rotations, origin, 1)
 
-    def _turned(self, motion: Tensor, origin: Tensor, way: int) -> Tensor:
-        """Turn the root's rotation and the positions; the other rotations are local, so they stay."""
+    def _turn_motion(self, motion: Tensor, origin: Tensor, way: int) -> Tensor:
+        """Turn the root's rotation and the positions. Other rotations are local and stay unchanged."""
         root, body = motion[..., :6], motion[..., 6 : ROTATION.stop]
-        return torch.cat([_turn(root, origin, way), body, _turn(motion[..., POSITION], origin, way)], -1)
+        return torch.cat(
+            [_turn_vectors(root, origin, way), body, _turn_vectors(motion[..., POSITION], origin, way)], -1
+        )
 
 
-def _turn(vectors: Tensor, origin: Tensor, way: int) -> Tensor:
-    """Turn vectors (..., 3 n) about the vertical by the heading of an origin (..., 5), or back (way -1)."""
+def _turn_vectors(vectors: Tensor, origin: Tensor, way: int) -> Tensor:
+    """Turn vectors (..., 3 n) about the vertical by an origin's heading (..., 5), or back for `way` -1."""
     x, y, z = vectors.unflatten(-1, (-1, 3)).unbind(-1)
     cosine, sine = origin[..., 3:4], way * origin[..., 4:5]
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1).flatten(-2)
 
 
-def _tile(point: Tensor, times: int) -> Tensor:
+def _repeat_point(point: Tensor, times: int) -> Tensor:
     """Repeat a point: (..., 3) to (..., 3 * times)."""
     return torch.cat([point] * times, -1)

@@ -1,4 +1,4 @@
-"""The conversion between the world and the network's space: coordinates and z-scores."""
+"""The conversion between world frames and network space: local coordinates and z-scores."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ from memmlp.motion.body import (
     SPARSE_DIM,
     SPARSE_POSITION,
 )
-from memmlp.motion.geometry import bone_chains, forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.geometry import build_bone_chains, forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.network_coordinates import Coordinates
 
 Change = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Maps a pose in the world, global rotations (..., 22, 3, 3) and joints (..., 22, 3), to another one. It is
-given the inputs (..., 54) and the rest joints (22, 3), too."""
+"""A function that changes a pose in the world. Its arguments are global rotations (..., 22, 3, 3), joints
+(..., 22, 3), inputs (..., 54) and rest joints (22, 3). It returns rotations and joints."""
 
 
-def in_float32(device: torch.device) -> AbstractContextManager[object]:
-    """Compute in float32 within the context, even in a mixed-precision training (`optim.precision=bf16`).
+def use_float32(device: torch.device) -> AbstractContextManager[object]:
+    """Compute in float32 within the context, even with mixed precision (`optim.precision=bf16`).
 
-    Without mixed precision it has no effect, and it leaves nothing in an exported graph.
+    It has no effect without mixed precision, or on exported graphs.
     """
     mixed = torch.is_autocast_enabled(device.type)
     return torch.autocast(device.type, enabled=False) if mixed else nullcontext()
 
 
 class Normalizer(nn.Module):
-    """Converts between the world and network space: the chosen coordinates, and z-scores.
+    """Converts between world frames and network space: local coordinates and z-scores.
 
     Args:
         coordinates: World(), HeadRelative() or Heading().
         rest: rest positions (22, 3), metres, for forward kinematics.
         mean: mean (252,) of frames [X | Theta] in the chosen coordinates.
-        std: their standard deviation (252,); values under 1e-3 are replaced by 1e-3.
+        std: standard deviation (252,) of the same frames; values below 1e-3 are replaced by 1e-3.
     """
 
-    MIN_STD = 1e-3  # keeps a constant feature constant, where a division by 0 would make noise of it
+    MIN_STD = 1e-3  # a smaller divisor would turn constant features into noise
 
     rest: Tensor
     mean: Tensor
@@ -59,17 +59,17 @@ class Normalizer(nn.Module):
         self.register_buffer("rest", rest.float())
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float().clamp_min(self.MIN_STD))
-        self.register_buffer("chains", bone_chains(), persistent=False)
+        self.register_buffer("chains", build_bone_chains(), persistent=False)
 
     @classmethod
-    def raw(cls, coordinates: Coordinates, rest: Tensor) -> Normalizer:
-        """Make a normalizer that only changes the coordinates, without z-scores."""
+    def from_coordinates(cls, coordinates: Coordinates, rest: Tensor) -> Normalizer:
+        """Make a normalizer without z-scores, which changes only the coordinates."""
         return cls(coordinates, rest, torch.zeros(FRAME_DIM), torch.ones(FRAME_DIM))
 
     @classmethod
     def fit(cls, coordinates: Coordinates, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Normalizer:
-        """Make a normalizer with the z-scores of training frames (F, 252), which are read chunk by chunk."""
-        plain = cls.raw(coordinates, rest).to(frames.device)
+        """Make a normalizer with z-scores from training frames (F, 252), which are read in chunks."""
+        plain = cls.from_coordinates(coordinates, rest).to(frames.device)
         count = len(frames)
         total = torch.zeros(FRAME_DIM, dtype=torch.float64, device=frames.device)
         for part in frames.split(chunk):
@@ -80,60 +80,66 @@ class Normalizer(nn.Module):
             square += (plain.encode(part).double() - mean).square().sum(0)
         return cls(coordinates, rest.cpu(), mean.cpu(), (square / count).sqrt().cpu())
 
-    def origin(self, sparse: Tensor) -> Tensor:
-        """Return the origin (..., 3 or 5) of the local coordinates of inputs (..., 54)."""
-        return self.coordinates.origin(sparse)
+    def find_origin(self, sparse: Tensor) -> Tensor:
+        """Return the origin (..., 3 or 5) of the local coordinates for inputs (..., 54)."""
+        return self.coordinates.find_origin(sparse)
 
     def encode(self, frames: Tensor) -> Tensor:
         """Convert world frames [X | Theta] (..., 252) to network space (..., 252)."""
         sparse, motion = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:]
-        origin = self.origin(sparse)
+        origin = self.find_origin(sparse)
         return torch.cat([self.encode_sparse(sparse, origin), self.encode_motion(motion, origin)], -1)
 
     def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """Convert world inputs (..., 54) with the given origin to network space (..., 54)."""
-        return (self.coordinates.sparse_in(sparse, origin) - self.mean[:SPARSE_DIM]) / self.std[:SPARSE_DIM]
+        return (self.coordinates.convert_inputs_to_local(sparse, origin) - self.mean[:SPARSE_DIM]) / self.std[
+            :SPARSE_DIM
+        ]
 
     def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert world motion (..., 198) with the given origin to network space (..., 198)."""
-        return (self.coordinates.motion_in(motion, origin) - self.mean[SPARSE_DIM:]) / self.std[SPARSE_DIM:]
+        return (self.coordinates.convert_motion_to_local(motion, origin) - self.mean[SPARSE_DIM:]) / self.std[
+            SPARSE_DIM:
+        ]
 
     def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert motion (..., 198) in network space with the given origin to the world (..., 198)."""
-        return self.coordinates.motion_out(motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], origin)
+        return self.coordinates.convert_motion_to_world(
+            motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], origin
+        )
 
-    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
-        """Convert joints' global rotations (..., 6 n), 6D, from the coordinates of an origin to the world."""
-        return self.coordinates.rotations_out(rotations, origin)
+    def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
+        """Convert joints' global rotations (..., 6 n), 6D, from local coordinates to the world."""
+        return self.coordinates.convert_rotations_to_world(rotations, origin)
 
-    def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
-        """Return joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).
+    def compute_positions(self, motion: Tensor, sparse: Tensor) -> Tensor:
+        """Compute joint positions (..., 22, 3), metres, world, from the rotations in world motion (..., 198).
 
-        They follow by forward kinematics, translated so that the head is at its tracker's position in the
-        world inputs (..., 54) (reading 22).
+        Forward kinematics gives the pose. The translation puts the head at the tracker's position in the
+        world inputs (..., 54) (docs/readings.md, no. 22).
         """
         rotations = motion[..., ROTATION].to(sparse.dtype).unflatten(-1, (N_JOINTS, 6))
-        with in_float32(sparse.device):
+        with use_float32(sparse.device):
             root = torch.zeros_like(sparse[..., :3])
             _, positions = forward_kinematics(sixd_to_matrix(rotations), root, self.rest)
         head = sparse[..., SPARSE_POSITION][..., :3]
         return positions + (head - positions[..., HEAD, :]).unsqueeze(-2)
 
-    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
-        """Make world motion (..., 198) from rotations (..., 132) in network space and world inputs (..., 54).
+    def decode_rotations(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+        """Convert network-space rotations (..., 132) to world motion (..., 198), for world inputs (..., 54).
 
-        The positions follow from the rotations (`pose`), without gradients.
+        `compute_positions` adds the positions, without gradients.
         """
         motion = F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
-        world = self.decode_motion(motion, self.origin(sparse))
-        positions = self.pose(world.detach(), sparse).flatten(-2)
+        world = self.decode_motion(motion, self.find_origin(sparse))
+        positions = self.compute_positions(world.detach(), sparse).flatten(-2)
         return torch.cat([world[..., ROTATION], positions], -1)
 
-    def posed_in_world(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
-        """Make world motion (..., 198) from global rotations (..., 132), 6D, and world inputs (..., 54).
+    def build_world_motion(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
+        """Build world motion (..., 198) from global rotations (..., 132), 6D, and world inputs (..., 54).
 
-        Joints follow by adding up the turned bones from the root on, the head on its tracker; no gradient
-        flows through them. `change` may alter rotations and positions before rotations are made local.
+        The positions are sums of the rotated bones, with the head at its tracker and without gradients.
+        `change` may change the pose before the rotations are converted to local ones.
         """
         matrices = sixd_to_matrix(rotations.unflatten(-1, (N_JOINTS, 6)))
         parents = matrices[..., list(PARENTS[1:]), :, :]

@@ -223,4 +223,6 @@ class AGRoLDiffusion(WindowModel):
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
         noisy, time, _ = self.diffusion.draw_noisy(clean)
-        return TrainingOutputs(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})
+        return TrainingOutputs(
+            self.normalizer.decode_rotations(self.denoise(noisy, time, encoded), window), kept, {}
+        )

@@ -81,7 +81,7 @@ class Architecture:
         rest = torch.as_tensor(np.asarray(manifest.rest), dtype=torch.float32)
         if self.normalize:
             return Normalizer.fit(self.coordinates, rest, frames)
-        return Normalizer.raw(self.coordinates, rest)
+        return Normalizer.from_coordinates(self.coordinates, rest)
 
     def load(self, weights: Path) -> MotionModel:
         """Load a trained network from a weights file.
@@ -91,6 +91,6 @@ class Architecture:
         """
         tensors, _ = checkpoint.read(weights)
         codes = self.vqvae() if self.uses_codes else None
-        model = self.build(Normalizer.raw(self.coordinates, torch.zeros(22, 3)), codes)
+        model = self.build(Normalizer.from_coordinates(self.coordinates, torch.zeros(22, 3)), codes)
         checkpoint.load_module("model", model, tensors)
         return model.eval()

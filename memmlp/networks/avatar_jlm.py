@@ -24,7 +24,7 @@ from memmlp.motion.body import (
     TRACKED,
 )
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
-from memmlp.motion.normalizer import Normalizer, in_float32
+from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import StemGraph
@@ -179,7 +179,7 @@ class AvatarJLM(WindowModel):
         """
         mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
         sixd = (self.coarse(embedded) * std + mean).unflatten(-1, (N_JOINTS, 6))
-        with in_float32(sixd.device):
+        with use_float32(sixd.device):
             local = sixd_to_matrix(sixd)
             pelvis = torch.zeros_like(local[..., 0, :, 0])
             rotations, positions = forward_kinematics(local, pelvis, self.normalizer.rest)
@@ -234,10 +234,10 @@ class AvatarJLM(WindowModel):
             true_frames: world frames [X | Theta] (B, T, 252).
         """
         sparse, motion = true_frames[..., :SPARSE_DIM], true_frames[..., SPARSE_DIM:]
-        origin = self.normalizer.origin(sparse)
+        origin = self.normalizer.find_origin(sparse)
         encoded = self.normalizer.encode_sparse(sparse, origin)
         made, _ = self.place_coarse_joints(self.embedding(spread_over_joints(encoded)))
-        true = self.normalizer.coordinates.motion_in(motion, origin)[..., POSITION]
+        true = self.normalizer.coordinates.convert_motion_to_local(motion, origin)[..., POSITION]
         joints = true.unflatten(-1, (N_JOINTS, 3))
         error = made - (joints - joints[..., HEAD : HEAD + 1, :])
         return {"coarse": self.coarse_weight * error.abs().mean()}

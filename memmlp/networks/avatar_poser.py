@@ -131,7 +131,7 @@ PLACES = 2 * len(TRACKED)  # components of the trackers' places on the floor
 def center_on_head(sparse: Tensor) -> Tensor:
     """Return inputs (..., 54) with floor positions relative to the head of the same frame."""
     space = HeadRelative()
-    return space.sparse_in(sparse, space.origin(sparse))
+    return space.convert_inputs_to_local(sparse, space.find_origin(sparse))
 
 
 def select_floor_positions(sparse: Tensor) -> Tensor:

@@ -209,7 +209,7 @@ class BoDiffusion(WindowModel):
         count, size = len(sparse), self.frames
         begin = torch.tensor([*range(0, count - size, size // 2), count - size], device=sparse.device)
         windows = begin[:, None] + torch.arange(size, device=sparse.device)
-        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))[windows]
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))[windows]
         times_covered = torch.bincount(windows.flatten(), minlength=count)[:, None]
 
         def total(parts: Tensor) -> Tensor:
@@ -220,7 +220,7 @@ class BoDiffusion(WindowModel):
             return total(mean) / times_covered, total(variance).sqrt() / times_covered
 
         rotation = self.diffusion.sample(step, self.draw_noise(count).to(self.noises))
-        return self.normalizer.posed(rotation, sparse)
+        return self.normalizer.decode_rotations(rotation, sparse)
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Add noise to the truth, and denoise it in one denoiser call; see MotionModel.
@@ -237,4 +237,4 @@ class BoDiffusion(WindowModel):
         error, bound = self.diffusion.compute_losses(clean, noise, time, made, self.compute_limits())
         found = self.diffusion.remove_noise(noisy, made.noise, time).clamp(*self.compute_limits())
         losses = {"noise": self.noise_weight * error, "bound": self.bound_weight * bound}
-        return TrainingOutputs(self.normalizer.posed(found, window), kept, losses)
+        return TrainingOutputs(self.normalizer.decode_rotations(found, window), kept, losses)

@@ -61,4 +61,4 @@ class ConstantPose(WindowlessModel):
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         seen = sparse if newest is None else sparse[:, -newest:]
-        return self.normalizer.posed(self.pose.expand(*seen.shape[:-1], -1), seen), state
+        return self.normalizer.decode_rotations(self.pose.expand(*seen.shape[:-1], -1), seen), state

@@ -27,7 +27,7 @@ from memmlp.motion.body import (
     TRACKED,
 )
 from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
-from memmlp.motion.normalizer import Normalizer, in_float32
+from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.transformer import make_encoder
@@ -65,7 +65,7 @@ def locate_hands(sparse: Tensor) -> list[Tensor]:
     float32, because velocities are small differences.
     """
     rotation, turn, position, velocity = split_by_feature(sparse)
-    with in_float32(sparse.device):
+    with use_float32(sparse.device):
         now = sixd_to_matrix(rotation)
         before = now @ sixd_to_matrix(turn).transpose(-1, -2)
         rotations, positions = convert_hands_to_head_frame(now, position)
@@ -113,7 +113,7 @@ class NormedLSTM(nn.Module):
         pairs = zip(self.directions, self.gains, strict=True)
         weights = [F.normalize(direction, dim=1) * gain for direction, gain in pairs]
         states = [state.contiguous()[None] for state in (hidden, cell)]
-        with in_float32(x.device):  # not every CPU has an LSTM in bfloat16
+        with use_float32(x.device):  # not every CPU has an LSTM in bfloat16
             made, *after = torch.lstm(
                 x.float() if x.dtype == torch.bfloat16 else x,
                 states, [*weights, *self.biases], True, 1, 0.0, self.training, False, True,
@@ -154,7 +154,7 @@ class HMDPoserGraph(FrameGraph):
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         features, kept = self.model.compute_features(sparse[None], state)
-        return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
+        return self.normalizer.decode_rotations(self.model.pose(features[0]), sparse), kept
 
 
 @component("model", "hmd_poser", builds="HMDPoser")
@@ -220,7 +220,7 @@ class HMDPoser(WindowlessModel):
 
     def make_tokens(self, sparse: Tensor) -> Tensor:
         """Map world inputs (B, n, 54) to the tokens (B, n, 8, d)."""
-        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
         nothing = [encoded.new_zeros(*encoded.shape[:-1], OTHERS, size) for size in (6, 6, 3)]
         found = []
         for layers, parts in (
@@ -246,7 +246,7 @@ class HMDPoser(WindowlessModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         features, kept = self.compute_features(sparse, state)
         wanted = sparse.shape[1] if newest is None else newest
-        return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
+        return self.normalizer.decode_rotations(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the motion, and add the loss of the predicted shape; see MotionModel."""
@@ -256,4 +256,4 @@ class HMDPoser(WindowlessModel):
             shapes = self.shape(features).to(self.normalizer.mean)  # their differences are small
             variation = (shapes - shapes.mean(1, keepdim=True)).abs().mean()
             losses["shape"] = self.shape_weight * variation
-        return TrainingOutputs(self.normalizer.posed(self.pose(features), sparse), kept, losses)
+        return TrainingOutputs(self.normalizer.decode_rotations(self.pose(features), sparse), kept, losses)

@@ -33,7 +33,7 @@ from memmlp.motion.body import (
 )
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.network_coordinates import Heading
-from memmlp.motion.normalizer import Normalizer, in_float32
+from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.avatar_jlm import AvatarJLM, AvatarJLMGraph, AvatarJLMSettings
 from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserGraph, AvatarPoserSettings, make_head
 from memmlp.networks.limb_solver import (
@@ -184,7 +184,7 @@ class Manikin(MotionModel):
 
         Limbs are always solved in float32.
         """
-        with in_float32(made.device):
+        with use_float32(made.device):
             return PredictedParts.from_outputs(made.to(encoded.dtype), self.normalizer).solve_pose(
                 encoded, self.normalizer
             )
@@ -195,21 +195,23 @@ class Manikin(MotionModel):
         angle = self.turned * 2 * math.pi * distributed.draw_rows(torch.rand_like, true_frames[:, :1, :1])
         heading = torch.cat([torch.zeros_like(true_frames[:, :1, :3]), angle.cos(), angle.sin()], -1)
         space = Heading()
-        window = space.sparse_in(inputs[:, -self.frames :], heading)
-        encoded = self.normalizer.encode_sparse(window, self.normalizer.origin(window))
+        window = space.convert_inputs_to_local(inputs[:, -self.frames :], heading)
+        encoded = self.normalizer.encode_sparse(window, self.normalizer.find_origin(window))
         made = self.predict_parts(encoded)
         count = made.shape[1]
         rotation = self.solve_pose(made, encoded[:, -count:])
-        motion = space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading)
-        true = torch.cat([window, space.motion_in(true_frames[..., SPARSE_DIM:], heading)], -1)
+        motion = space.convert_motion_to_world(
+            self.normalizer.decode_rotations(rotation, window[:, -count:]), heading
+        )
+        true = torch.cat([window, space.convert_motion_to_local(true_frames[..., SPARSE_DIM:], heading)], -1)
         return TrainingOutputs(motion, kept, self.compute_losses(made, true))
 
     def compute_losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of outputs (B, n, 86 or more), given true world frames (B, T, 252)."""
-        motion = self.normalizer.coordinates.motion_in(
-            true[..., SPARSE_DIM:], self.normalizer.origin(true[..., :SPARSE_DIM])
+        motion = self.normalizer.coordinates.convert_motion_to_local(
+            true[..., SPARSE_DIM:], self.normalizer.find_origin(true[..., :SPARSE_DIM])
         )
-        with in_float32(made.device):
+        with use_float32(made.device):
             parts = self.compute_part_losses(made.to(true.dtype), TrueParts(motion[:, -made.shape[1] :]))
         return {name: self.parts_weight * term for name, term in parts.items()}
 

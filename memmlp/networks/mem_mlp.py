@@ -142,7 +142,7 @@ class MemMLPGraph(StreamingGraph):
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         memory = self.recall.memory
-        origin = self.normalizer.origin(sparse)
+        origin = self.normalizer.find_origin(sparse)
         encoded = self.conversions.encode_sparse(sparse, origin)
         queue = torch.cat([fill_past(state["sparse"], encoded, fresh), encoded[None]], 1)
         past = memory.recall(queue, state, 1)
@@ -289,7 +289,7 @@ class MemMLP(MotionModel):
         """
         new = sparse.shape[1]
         inputs, kept = self.append_inputs(sparse, state)
-        origin = self.normalizer.origin(inputs)
+        origin = self.normalizer.find_origin(inputs)
         encoded = self.normalizer.encode_sparse(inputs, origin)
         past = self.memory.recall(encoded, state, new)
         h = self.stem(encoded[:, -self.frames :])

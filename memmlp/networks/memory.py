@@ -20,7 +20,7 @@ from memmlp.common.components import component
 from memmlp.common.errors import InputError
 from memmlp.common.settings import Settings, at_least, each, one_of, setting
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.normalizer import Normalizer, in_float32
+from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.motion_model import State
 from memmlp.networks.streaming import FrameGRU
@@ -263,7 +263,7 @@ class Recurrence(nn.Module):
         """
         states = tuple(state.contiguous()[None] for state in carried)
         single = len(states) == 1  # a GRU, which takes and returns its one state as a tensor
-        with in_float32(sparse.device):  # not every CPU has an LSTM in bfloat16
+        with use_float32(sparse.device):  # not every CPU has an LSTM in bfloat16
             output, after = self.layer(self.norm(sparse), states[0] if single else states)
         return F.silu(output), [state[0] for state in ([after] if single else after)]
 

@@ -188,10 +188,10 @@ class WindowModel(MotionModel):
         inputs, kept = self.append_inputs(sparse, state)
         window = inputs[:, -self.frames :]
         rotation = self.predict_rotations(
-            self.normalizer.encode_sparse(window, self.normalizer.origin(window))
+            self.normalizer.encode_sparse(window, self.normalizer.find_origin(window))
         )
         wanted = self.frames if newest is None else newest
-        return self.normalizer.posed(rotation[:, -wanted:], window[:, -wanted:]), kept
+        return self.normalizer.decode_rotations(rotation[:, -wanted:], window[:, -wanted:]), kept
 
 
 class NewestFrameModel(MotionModel):
@@ -213,10 +213,10 @@ class NewestFrameModel(MotionModel):
         wanted = sparse.shape[1] if newest is None else newest
         ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)
         window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)
-        encoded = self.normalizer.encode_sparse(inputs, self.normalizer.origin(inputs))
+        encoded = self.normalizer.encode_sparse(inputs, self.normalizer.find_origin(inputs))
         windows = torch.unflatten(encoded.index_select(1, window.flatten()), 1, window.shape)
         rotation = torch.unflatten(self.predict_rotations(windows.flatten(0, 1)), 0, (len(inputs), wanted))
-        return self.normalizer.posed(rotation, inputs[:, -wanted:]), kept
+        return self.normalizer.decode_rotations(rotation, inputs[:, -wanted:]), kept
 
 
 def fill_past(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:

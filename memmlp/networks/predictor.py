@@ -130,8 +130,8 @@ class Predictor(nn.Module):
         if "position" in self.branches:
             return torch.cat([rotation, self.position(h, past, newest)], -1)
         sparse = sparse[..., -newest:, :]
-        posed = normalizer.posed(rotation.detach(), sparse)
-        motion = normalizer.encode_motion(posed, normalizer.origin(sparse))
+        posed = normalizer.decode_rotations(rotation.detach(), sparse)
+        motion = normalizer.encode_motion(posed, normalizer.find_origin(sparse))
         return torch.cat([rotation, motion[..., ROTATION.stop :]], -1)
 
 

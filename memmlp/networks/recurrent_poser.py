@@ -14,7 +14,7 @@ from memmlp.common.components import component
 from memmlp.common.settings import at_least, one_of, setting, sized
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
-from memmlp.motion.normalizer import Normalizer, in_float32
+from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.layers import compute_gate_products, step_gru
 from memmlp.networks.limb_solver import bend_arms_to_trackers, use_tracker_rotations
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
@@ -190,7 +190,7 @@ class RecurrentBlock(nn.Module):
         if h.dim() == 2:
             made, state = self.cell.step(x, state)
         else:
-            with in_float32(h.device):  # a state adds up what bfloat16 rounds
+            with use_float32(h.device):  # a state adds up what bfloat16 rounds
                 made, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
         h = h + made
         return h + self.mlp(self.norm(h)), state
@@ -342,13 +342,15 @@ class RecurrentPoser(WindowlessModel):
         do not inherit errors from a joint's ancestors. Positions are sums of rotated bones.
         """
         if self.output == "local":
-            return self.normalizer.posed(made, sparse)
-        with in_float32(made.device):
-            rotations = self.normalizer.rotations_out(made.to(sparse.dtype), self.normalizer.origin(sparse))
+            return self.normalizer.decode_rotations(made, sparse)
+        with use_float32(made.device):
+            rotations = self.normalizer.convert_rotations_to_world(
+                made.to(sparse.dtype), self.normalizer.find_origin(sparse)
+            )
             if not (reach and self.output == "reaching"):
-                return self.normalizer.posed_in_world(rotations, sparse)
+                return self.normalizer.build_world_motion(rotations, sparse)
             rotations = use_tracker_rotations(rotations, sparse)
-            return self.normalizer.posed_in_world(rotations, sparse, bend_arms_to_trackers)
+            return self.normalizer.build_world_motion(rotations, sparse, bend_arms_to_trackers)
 
     def predict_members(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Return the rotations of each member (members, ..., 132), and the new state.
@@ -357,7 +359,7 @@ class RecurrentPoser(WindowlessModel):
             sparse: world inputs (B, n, 54), or (B, 54) for one frame, which uses plain layers.
             state: the state before these frames.
         """
-        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
         made: list[Tensor] = []
         kept: State = {}
         for name, member in self.members.items():

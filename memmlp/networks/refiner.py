@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from memmlp.common.components import component
 from memmlp.common.settings import Settings, at_least, one_of, positive, setting
 from memmlp.motion.body import POSITION, ROTATION
-from memmlp.motion.normalizer import Normalizer, in_float32
+from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.motion_model import MotionModel, State, StreamingGraph
 from memmlp.networks.streaming import FrameGRU, has_streaming_graph, streaming
 
@@ -149,11 +149,11 @@ class RefinedModel(MotionModel):
             Motion (B, n, 198), and the new hidden states.
         """
         rotation = motion[..., ROTATION]
-        with in_float32(motion.device):
+        with use_float32(motion.device):
             features, after = self.layers(rotation, hidden.transpose(0, 1).contiguous())
         rotation = rotation + self.head(features)
         positions = motion[..., POSITION]
         if "position" not in self.branches:
             refined = torch.cat([rotation, positions], -1).detach()
-            positions = self.normalizer.pose(refined, sparse).flatten(-2)
+            positions = self.normalizer.compute_positions(refined, sparse).flatten(-2)
         return torch.cat([rotation, positions], -1), after.transpose(0, 1)

@@ -156,7 +156,7 @@ class RPM(WindowlessModel):
 
     def encode(self, sparse: Tensor) -> Tensor:
         """Map world inputs (..., 54) to network space."""
-        return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        return self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         shown = []
@@ -164,7 +164,7 @@ class RPM(WindowlessModel):
             made, state = self.step_frame(frame, state)
             shown.append(made[:, :1])
         wanted = sparse.shape[1] if newest is None else newest
-        return self.normalizer.posed(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
+        return self.normalizer.decode_rotations(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Run over a few frames without gradients, then predict with gradients; see MotionModel.
@@ -191,4 +191,4 @@ class RPM(WindowlessModel):
         self.train(training)
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         made, state = self.step_frame(encoded[:, now : now + 1], state)
-        return TrainingOutputs(self.normalizer.posed(made, sparse[:, now:]), state, {})
+        return TrainingOutputs(self.normalizer.decode_rotations(made, sparse[:, now:]), state, {})

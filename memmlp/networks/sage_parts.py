@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import N_JOINTS, ROTATION, TRACKED
-from memmlp.motion.normalizer import in_float32
+from memmlp.motion.normalizer import use_float32
 from memmlp.networks.avatar_jlm import JOINT_DIM, group_by_tracker
 from memmlp.networks.bodiffusion import SINES
 from memmlp.networks.diffusion import TimeEmbedding
@@ -169,7 +169,7 @@ class ProductQuantiser(nn.Module):
 
         Distances to the code-vectors are in float32, also in mixed-precision training.
         """
-        with in_float32(z.device):
+        with use_float32(z.device):
             z = z.to(self.vectors.dtype)
             parts = z.flatten(0, -2).unflatten(-1, (BOOKS, -1)).transpose(0, 1)
             distance = torch.cdist(parts, self.vectors).square()

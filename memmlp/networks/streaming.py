@@ -100,10 +100,12 @@ class OneFrameNormalizer(Normalizer):
     def __init__(self, normalizer: Normalizer):
         super().__init__(normalizer.coordinates, normalizer.rest, normalizer.mean, normalizer.std)
         exact = copy.deepcopy(normalizer).double()
-        turns = exact.origin(torch.zeros(1, SPARSE_DIM)).shape[-1] - 3
+        turns = exact.find_origin(torch.zeros(1, SPARSE_DIM)).shape[-1] - 3
 
         def encode(x: Tensor, turn: Tensor) -> Tensor:
-            return exact.encode_sparse(x, torch.cat([exact.origin(x)[..., :3], turn.expand(len(x), -1)], -1))
+            return exact.encode_sparse(
+                x, torch.cat([exact.find_origin(x)[..., :3], turn.expand(len(x), -1)], -1)
+            )
 
         def decode(x: Tensor, turn: Tensor) -> Tensor:
             return exact.decode_motion(
@@ -115,7 +117,7 @@ class OneFrameNormalizer(Normalizer):
             return decode(padded, turn)[:, ROTATION]
 
         def turn_rotations(x: Tensor, turn: Tensor) -> Tensor:
-            return exact.rotations_out(x, F.pad(turn.expand(len(x), -1), (3, 0)))
+            return exact.convert_rotations_to_world(x, F.pad(turn.expand(len(x), -1), (3, 0)))
 
         self.encoder = OneFrameConversion(encode, SPARSE_DIM, turns)
         self.decoder = OneFrameConversion(decode, MOTION_DIM + 3, turns)
@@ -131,15 +133,15 @@ class OneFrameNormalizer(Normalizer):
         """Convert motion (1, 198) in network space to the world (1, 198)."""
         return self.decoder(torch.cat([motion, origin[:, :3]], -1), origin)
 
-    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+    def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
         """Convert joints' global rotations (1, 132), 6D, from the coordinates of an origin to the world."""
         return self.rotation_turner(rotations, origin)
 
-    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+    def decode_rotations(self, rotation: Tensor, sparse: Tensor) -> Tensor:
         """Make world motion (1, 198) from rotations (1, 132) in network space at world inputs (1, 54)."""
-        world = self.rotation_decoder(rotation, self.origin(sparse))
+        world = self.rotation_decoder(rotation, self.find_origin(sparse))
         motion = F.pad(world, (0, POSITION.stop - ROTATION.stop))
-        return torch.cat([world, self.pose(motion, sparse).flatten(-2)], -1)
+        return torch.cat([world, self.compute_positions(motion, sparse).flatten(-2)], -1)
 
 
 class OneFrameConversion(nn.Module):
@@ -187,10 +189,12 @@ class StemGraph(StreamingGraph):
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
         entering = self.embed_frame(encoded)
         window = torch.cat([fill_past(state["stem"], entering, fresh), entering])
-        return self.normalizer.posed(self.predict_rotation(window, encoded), sparse), {"stem": window[1:]}
+        return self.normalizer.decode_rotations(self.predict_rotation(window, encoded), sparse), {
+            "stem": window[1:]
+        }
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
         """Map one frame's inputs (1, 54) in network space to its carried values (1, d)."""

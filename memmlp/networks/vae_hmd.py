@@ -98,7 +98,7 @@ class VAEHMDGraph(FrameGraph):
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) to world motion (1, 198); no state is carried."""
         mean = self.model.encode(sparse).chunk(2, -1)[0]
-        return self.normalizer.posed(self.model.decoder(mean), sparse), {}
+        return self.normalizer.decode_rotations(self.model.decoder(mean), sparse), {}
 
 
 @component("model", "vae_hmd", builds="VAEHMD")
@@ -146,12 +146,12 @@ class VAEHMD(WindowlessModel):
 
     def encode(self, sparse: Tensor) -> Tensor:
         """Map world inputs (..., 54) to latents (..., 2 z)."""
-        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
         return self.encoder(torch.cat([encoded[..., part] for part in POSES], -1))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         seen = sparse if newest is None else sparse[:, -newest:]
-        return self.normalizer.posed(self.decoder(self.encode(seen).chunk(2, -1)[0]), seen), state
+        return self.normalizer.decode_rotations(self.decoder(self.encode(seen).chunk(2, -1)[0]), seen), state
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Decode each window either from its true poses or from its trackers; see MotionModel.
@@ -164,7 +164,7 @@ class VAEHMD(WindowlessModel):
         sample = draw_latent(latent)
         frozen = {name: weight.detach() for name, weight in self.decoder.named_parameters()}
         live, still = self.decoder(sample), functional_call(self.decoder, frozen, (sample,))
-        motion = self.normalizer.posed(posed * live + (1 - posed) * still, sparse)
+        motion = self.normalizer.decode_rotations(posed * live + (1 - posed) * still, sparse)
         return TrainingOutputs(
             motion, state, {"divergence": self.divergence_weight * compute_divergence(latent)}
         )

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM
-from memmlp.motion.normalizer import Normalizer, in_float32
+from memmlp.motion.normalizer import Normalizer, use_float32
 
 
 class QuantisedLatents(NamedTuple):
@@ -43,7 +43,7 @@ class Codebook(nn.Module):
 
     def find_indices(self, latent: Tensor) -> Tensor:
         """Return the index (...) of the nearest code-vector (Euclidean) for each latent (..., width)."""
-        with in_float32(latent.device):  # bfloat16 would make another code-vector the nearest
+        with use_float32(latent.device):  # bfloat16 would make another code-vector the nearest
             products = latent.to(self.vectors.dtype) @ self.vectors.T
             return (self.vectors.square().sum(-1) - 2 * products).argmin(-1)
 
@@ -82,7 +82,7 @@ class EMACodebook(Codebook):
 
     def learn(self, latent: Tensor) -> QuantisedLatents:
         """Quantise latents (B, width) and move the code-vectors towards them."""
-        with in_float32(latent.device):  # running means need float32
+        with use_float32(latent.device):  # running means need float32
             codes, index = self._update_means(latent.detach().to(self.vectors.dtype))
         return QuantisedLatents(codes, index, self.commitment * F.mse_loss(latent, codes))
 
@@ -172,7 +172,7 @@ class VQVAE(nn.Module):
         The latents are always computed in float32: in lower precision, training would find other code-vectors
         than evaluation and export.
         """
-        with in_float32(frames.device):
+        with use_float32(frames.device):
             return self.encoder(frames.to(self.codebook.vectors.dtype))
 
     def compute_code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:

@@ -14,10 +14,10 @@ from typing import Any
 from memmlp.common.components import find_chosen_settings
 from memmlp.common.progress import announce, notify
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import LINES, Skipped
-from memmlp.motion.motion_source import MotionSource, Prepared
-from memmlp.motion.preparing.amass_names import absent_subsets
-from memmlp.motion.preparing.groups import divided_remark, unmatched_patterns_remark
+from memmlp.motion.clip import LINES, SkippedFile
+from memmlp.motion.motion_source import MotionSource, PreparedMotion
+from memmlp.motion.preparing.amass_names import describe_absent_subsets
+from memmlp.motion.preparing.groups import describe_divided_folders, describe_unmatched_patterns
 from memmlp.motion.preparing.manifest import ClipRecord, Manifest
 from memmlp.runs.environment import describe_user_packages
 from memmlp.runs.evaluation_file import read_report
@@ -127,7 +127,7 @@ class Outcome:
 
 def find_finished_outcome(request: RunRequest) -> Outcome | None:
     """Return a request's outcome if its run and all stages exist; None if work remains."""
-    if request.config["force"] or request.config["save_predictions"] or request.motion.digest() is None:
+    if request.config["force"] or request.config["save_predictions"] or request.motion.find_digest() is None:
         return None
     data = request.motion.prepare()
     run = Run.from_id(request.outputs, request.identity(data.digest).id)
@@ -139,7 +139,7 @@ def find_finished_outcome(request: RunRequest) -> Outcome | None:
     return Outcome(run, (), read_results(request, run), request.stage_ids)
 
 
-def announce_data(data: Prepared) -> None:
+def announce_data(data: PreparedMotion) -> None:
     """Print facts and warnings about the data before a run begins."""
     clips = data.manifest.clips
     announce(f"data: {len(clips)} clips ({describe_test_clips(clips)}), prepared in {data.cache}")
@@ -191,15 +191,15 @@ def read_clip_rows(request: RunRequest, run: Run) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def list_data_remarks(data: Prepared) -> list[str]:
+def list_data_remarks(data: PreparedMotion) -> list[str]:
     """Return the warnings about the data to print before a run begins."""
     manifest = data.manifest
     found = (
         describe_skipped_files(manifest.skipped),
         describe_unusual_clips(manifest.unusual),
         describe_low_rates(manifest, manifest.clips, "clips"),
-        divided_remark(manifest),
-        unmatched_patterns_remark(manifest.split, [clip.name for clip in manifest.clips]),
+        describe_divided_folders(manifest),
+        describe_unmatched_patterns(manifest.split, [clip.name for clip in manifest.clips]),
     )
     return list(filter(None, found))
 
@@ -233,7 +233,7 @@ def describe_low_rates(manifest: Manifest, clips: Sequence[ClipRecord], what: st
     )
 
 
-def describe_skipped_files(skipped: Sequence[Skipped]) -> str | None:
+def describe_skipped_files(skipped: Sequence[SkippedFile]) -> str | None:
     """Return a remark on skipped files; None without skipped files."""
     if not skipped:
         return None
@@ -252,7 +252,7 @@ def describe_unusual_clips(unusual: Mapping[str, str]) -> str | None:
     return f"{clips} unusual, first {names}; details: memmlp data inspect"
 
 
-def collect_data_warnings(config: Mapping[str, Any], data: Prepared) -> dict[str, Any]:
+def collect_data_warnings(config: Mapping[str, Any], data: PreparedMotion) -> dict[str, Any]:
     """Return warnings about a run's data by name, for tables; None where a warning does not apply.
 
     Args:
@@ -265,18 +265,18 @@ def collect_data_warnings(config: Mapping[str, Any], data: Prepared) -> dict[str
     odd = [f"{name} ({manifest.unusual[name]})" for name in names]
     return {
         "partial": describe_missing_data(config, data),
-        "divided": divided_remark(manifest) or None,
+        "divided": describe_divided_folders(manifest) or None,
         "resampled": describe_low_rates(manifest, tested, "test clips"),
         "unusual": f"{len(odd)} of {len(tested)} test clips are unusual, first {odd[0]}" if odd else None,
     }
 
 
-def describe_missing_data(config: Mapping[str, Any], data: Prepared) -> str | None:
+def describe_missing_data(config: Mapping[str, Any], data: PreparedMotion) -> str | None:
     """Describe missing data of the protocol or of the training groups; None if the data is complete."""
     own, manifest = config["data"], data.manifest
     coverage, found = manifest.coverage, manifest.listed or (*manifest.left_out, *manifest.groups)
     fraction = own["split"].get("train_fraction", 1)
-    parts = [] if coverage.whole else [str(coverage)]
-    parts += [absent] if (absent := absent_subsets(own["name"], found)) else []
+    parts = [] if coverage.is_complete else [str(coverage)]
+    parts += [absent] if (absent := describe_absent_subsets(own["name"], found)) else []
     parts += [f"{100 * fraction:g} % of its training groups"] if fraction < 1 else []
     return ", ".join([own["name"], *parts]) if parts else None

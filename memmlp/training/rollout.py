@@ -64,7 +64,7 @@ class TeacherForcing(Rollout):
     ) -> TrainingCall:
         clips, end = map(distributed.take_local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
-        stretch = dataset.stretches(clips, end, past + stride)
+        stretch = dataset.read_stretches(clips, end, past + stride)
         state = model.true_state(stretch[:, :past])
         return TrainingCall(stretch[:, past:, :SPARSE_DIM], state, stretch[:, -model.frames :], clips)
 
@@ -100,7 +100,7 @@ class OwnPredictions(Rollout):
         clips, end = map(distributed.take_local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
-        stretch = dataset.stretches(clips, end, past + stride * (passes + 1))
+        stretch = dataset.read_stretches(clips, end, past + stride * (passes + 1))
         sparse = stretch[..., :SPARSE_DIM]
         state = model.running_state(sparse[:, :past])
         model.eval()
@@ -163,7 +163,7 @@ class PersistentStreams(Rollout):
         """
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
-        again = sampler.draw_beginnings(step, model.stride)
+        again = sampler.draw_stream_starts(step, model.stride)
         clips, end = (torch.where(self.lives[who], *pair) for pair in zip(again, (clips, end), strict=True))
         going = self.lives[who] & (self.end[who] + model.stride < dataset.lengths[self.clip[who]])
         self.clip[who] = torch.where(going, self.clip[who], clips)
@@ -171,7 +171,7 @@ class PersistentStreams(Rollout):
         self.lives[who] = True
         self.who, mine, going = who, distributed.take_local_rows(who), distributed.take_local_rows(going)
         past, stride = model.past_frames, model.stride
-        stretch = dataset.stretches(self.clip[mine], self.end[mine], past + stride)
+        stretch = dataset.read_stretches(self.clip[mine], self.end[mine], past + stride)
         fresh = model.running_state(stretch[:, :past, :SPARSE_DIM])
         state = {}
         for name, tensor in fresh.items():

@@ -26,7 +26,7 @@ from memmlp.evaluation.evaluation import Evaluation, predict_first_clip
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.live.pose_latency import measure_pose_times
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.motion_source import Prepared
+from memmlp.motion.motion_source import PreparedMotion
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.runs.environment import PREREQUISITES, list_prerequisite_origins
@@ -154,7 +154,7 @@ def run_experiment(experiment: Experiment, on_validation: ValidationCallback | N
 
 
 def complete_stages(
-    experiment: Experiment, run: Run, data: Prepared, again: bool = False
+    experiment: Experiment, run: Run, data: PreparedMotion, again: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
     """Run the missing evaluations and deployment of a trained run, and return its results.
 
@@ -174,7 +174,7 @@ def complete_stages(
     return read_results(experiment, run), made
 
 
-def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
+def make_missing_stages(experiment: Experiment, run: Run, data: PreparedMotion) -> list[str]:
     """Run the missing evaluations and deployment of a trained run.
 
     Returns:
@@ -193,7 +193,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
     return made
 
 
-def make_prerequisites(experiment: Experiment, data: Prepared, last: str | None = None) -> Run | None:
+def make_prerequisites(experiment: Experiment, data: PreparedMotion, last: str | None = None) -> Run | None:
     """Train the missing prerequisite runs in order; return the last run, or None without prerequisites.
 
     Args:
@@ -215,7 +215,7 @@ def find_or_train(
     experiment: Experiment,
     training: Training,
     identity: Identity,
-    data: Prepared,
+    data: PreparedMotion,
     before: Run | None,
 ) -> Run:
     """Return the prerequisite run with that identity; train it from the run `before` if necessary."""
@@ -263,7 +263,7 @@ def record_outcome(experiment: Experiment, run: Run, again: bool = False) -> Ite
 def train_run(
     experiment: Experiment,
     run: Run,
-    data: Prepared,
+    data: PreparedMotion,
     before: Run | None,
     on_validation: ValidationCallback | None = None,
 ) -> None:
@@ -280,7 +280,7 @@ def train_run(
     run.finish(("model.safetensors",))
 
 
-def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequence[str]) -> None:
+def evaluate_run(experiment: Experiment, run: Run, data: PreparedMotion, modes: Sequence[str]) -> None:
     """Evaluate a trained run in the given modes.
 
     Each evaluation is one file, which is written atomically. The picture is drawn once.
@@ -315,7 +315,7 @@ def draw_first_clip(model: MotionModel, test: MotionDataset, path: Path) -> None
     write_picture(path, ClipPiece(test.names[0], truth, {"prediction": predicted}))
 
 
-def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
+def deploy_run(experiment: Experiment, run: Run, data: PreparedMotion) -> None:
     """Export a trained run, compare the file with torch, and time it."""
     run.attempt("deployment")
     announce("deployment: export to ONNX, compare with torch, and time a frame")
@@ -324,7 +324,7 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
     assert name is not None
     with record_time(run, "export"):
         model = experiment.architecture.load(run.weights())
-        clips = [data.open(part).clips() for part in ("train", "test")]
+        clips = [data.open(part).read_clips() for part in ("train", "test")]
         deployed = run.deployment(name)
         deployed.latency.unlink(missing_ok=True)  # an incomplete deployment is made again from the start
         record = deployment.deploy(model, deployed, run.id, *clips)

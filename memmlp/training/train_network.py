@@ -14,7 +14,7 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
-from memmlp.motion.motion_source import Prepared
+from memmlp.motion.motion_source import PreparedMotion
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
@@ -46,7 +46,7 @@ class Training:
     def train(
         self,
         architecture: Architecture,
-        data: Prepared,
+        data: PreparedMotion,
         prerequisite: Path | None,
         run: Run,
         device: torch.device,
@@ -101,7 +101,7 @@ class NetworkTraining(Training):
     def train(
         self,
         architecture: Architecture,
-        data: Prepared,
+        data: PreparedMotion,
         prerequisite: Path | None,
         run: Run,
         device: torch.device,
@@ -115,7 +115,11 @@ class NetworkTraining(Training):
         return read_last_errors(run)
 
     def make_task(
-        self, architecture: Architecture, data: Prepared, prerequisite: Path | None, device: torch.device
+        self,
+        architecture: Architecture,
+        data: PreparedMotion,
+        prerequisite: Path | None,
+        device: torch.device,
     ) -> MotionTask:
         """Make the task of training a new network; see `train` for the arguments.
 
@@ -211,7 +215,7 @@ class VQVAETraining(Training):
     def train(
         self,
         architecture: Architecture,
-        data: Prepared,
+        data: PreparedMotion,
         prerequisite: Path | None,
         run: Run,
         device: torch.device,
@@ -251,7 +255,7 @@ class VQVAETask(TrainingTask):
     def step(self, step: int) -> StepResult:
         """Compute the loss on a batch of single frames."""
         clips, end = map(distributed.take_local_rows, self.sampler.draw(step))
-        frames = self.normalizer.encode(self.dataset.stretches(clips, end, 1))[:, 0]
+        frames = self.normalizer.encode(self.dataset.read_stretches(clips, end, 1))[:, 0]
         terms, indices = self.model.compute_losses(frames, self.normalizer)
         self.used = torch.bincount(distributed.gather_rows(indices), minlength=len(self.used)).float()
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)

@@ -16,7 +16,7 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import HANDS, HEAD, ROOT, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
-from memmlp.motion.motion_source import Prepared
+from memmlp.motion.motion_source import PreparedMotion
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
@@ -104,7 +104,7 @@ class RefinerTraining(Training):
     def train(
         self,
         architecture: Architecture,
-        data: Prepared,
+        data: PreparedMotion,
         prerequisite: Path | None,
         run: Run,
         device: torch.device,
@@ -137,7 +137,7 @@ class RefinerTraining(Training):
             dataset, self.refiner.pieces, self.refiner.frames, self.seed, self.drawn_by, self.shares
         )
         clips, end = pieces.draw(0)
-        return dataset.stretches(clips, end, self.refiner.frames), clips
+        return dataset.read_stretches(clips, end, self.refiner.frames), clips
 
 
 class RefinerTask(TrainingTask):

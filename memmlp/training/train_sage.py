@@ -24,8 +24,8 @@ from memmlp.common.components import component
 from memmlp.common.settings import Settings, at_least, each, fraction, group, positive, setting, sized
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
-from memmlp.motion.motion_source import Prepared
-from memmlp.motion.normalizer import in_float32
+from memmlp.motion.motion_source import PreparedMotion
+from memmlp.motion.normalizer import use_float32
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.sage_net import SAGENet
@@ -170,7 +170,7 @@ class SAGEPartTraining(Training):
     def train(
         self,
         architecture: Architecture,
-        data: Prepared,
+        data: PreparedMotion,
         prerequisite: Path | None,
         run: Run,
         device: torch.device,
@@ -209,7 +209,7 @@ class SAGEDecoderTraining(SAGEPartTraining):
     def train(
         self,
         architecture: Architecture,
-        data: Prepared,
+        data: PreparedMotion,
         prerequisite: Path | None,
         run: Run,
         device: torch.device,
@@ -237,12 +237,12 @@ class SAGEPartTask(TrainingTask):
         draws = network.optim.batch, frames, network.seed, network.drawn_by, network.shares
         self.sampler = WindowSampler(self.dataset, *draws)
         drawn = WindowSampler(validation, VALIDATION_WINDOWS, frames, seed=0).draw(0)
-        self.validation = validation.stretches(*drawn, frames)
+        self.validation = validation.read_stretches(*drawn, frames)
 
     def step(self, step: int) -> StepResult:
         """Compute the losses on a batch of windows."""
         clips, end = map(distributed.take_local_rows, self.sampler.draw(step))
-        terms = self.objective(self.dataset.stretches(clips, end, self.frames), True)
+        terms = self.objective(self.dataset.read_stretches(clips, end, self.frames), True)
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     @torch.no_grad()
@@ -311,9 +311,9 @@ def measure_half_errors(
     sparse, own = frame[:, None, :SPARSE_DIM], list(joints)
     full = truth.clone()
     full[:, own] = predicted.to(truth)
-    motions = [net.normalizer.posed(sixd.flatten(-2)[:, None], sparse) for sixd in (full, truth)]
+    motions = [net.normalizer.decode_rotations(sixd.flatten(-2)[:, None], sparse) for sixd in (full, truth)]
     bodies = [BodyMotion(motion, net.normalizer) for motion in motions]
-    with in_float32(frame.device):
+    with use_float32(frame.device):
         (found, placed), (expected, true_placed) = [(one.sixd, one.global_pose[1]) for one in bodies]
     errors = {
         "orientation": F.smooth_l1_loss(found[..., ROOT, :], expected[..., ROOT, :]),
@@ -360,7 +360,7 @@ def encode_latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tenso
     The latents are always computed in float32, because rounding would select other code-vectors.
     """
     assert not codes.training
-    with in_float32(rotation.device):
+    with use_float32(rotation.device):
         return codes.encode(rotation, encoded)[0]
 
 

@@ -23,7 +23,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Calibration, Offsets, save_calibration
-from memmlp.motion.body import PARENTS, RECORD, body_record, builtin_rest_joints
+from memmlp.motion.body import PARENTS, RECORD, describe_body, make_builtin_rest_joints
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -90,7 +90,7 @@ def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_p
     (tmp_path / "mine").mkdir()
     copied = tmp_path / "mine" / clip.name
     copied.write_bytes(clip.read_bytes())
-    write_json(tmp_path / "mine" / RECORD, body_record("builtin", builtin_rest_joints()))
+    write_json(tmp_path / "mine" / RECORD, describe_body("builtin", make_builtin_rest_joints()))
     with pytest.raises(InputError, match=r"mine: .*builtin"):
         load_tracked_clip(given._replace(clip=str(copied)))
 

@@ -13,7 +13,7 @@ import pytest
 from memmlp.common.files import write_json
 from memmlp.config.open_run import open_run
 from memmlp.evaluation.predictions import predict_clip
-from memmlp.motion.body import body_record
+from memmlp.motion.body import describe_body
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
 from memmlp.runs.lookup import is_trained, list_runs
@@ -47,7 +47,7 @@ def test_a_test_clip_is_written_in_every_format(home: Path, run: str, clip: str)
         assert (home / name).stat().st_size > 10_000
     with contextlib.chdir(home):
         opened = open_run(Path("outputs"), run)
-        frames = opened.test.clip(0)
+        frames = opened.test.read_clip(0)
         expected = predict_clip(opened.network(), frames, "stream")["predicted_positions"]
     root = read_bvh(home / "a.bvh").kinematics()[1][:, 0]
     np.testing.assert_allclose(root / 100, expected[:, 0][:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
@@ -80,7 +80,7 @@ def test_foreign_clips_need_the_run_alone(home: Path, run: str, tmp_path: Path):
     assert "skipped bad.npz: " in said
     assert names(tmp_path / "out", "glb") == names(tmp_path / "clips", "npz") - {"bad"} != set()
     assert not (tmp_path / "outputs" / "cache").exists()
-    write_json(tmp_path / "clips" / "import.json", body_record("model.npz", np.ones((22, 3))))
+    write_json(tmp_path / "clips" / "import.json", describe_body("model.npz", np.ones((22, 3))))
     line = command_line.run(tmp_path, "predict", run, "clips", "--out", "b", "--format", "gltf", code=2)
     assert "imported onto the body model.npz" in line
 

@@ -37,7 +37,7 @@ def test_paper_profile_has_the_published_size(name, monkeypatch):
     monkeypatch.setattr("torch.nn.Linear.reset_parameters", lambda layer: None)
     monkeypatch.setattr("torch.Tensor.normal_", lambda tensor, *_, **options: tensor.zero_())
     architecture = build_experiment(compose_config([f"model={name}", "profile=paper"])).architecture
-    model = architecture.build(Normalizer.raw(architecture.coordinates, tiny.REST), None).eval()
+    model = architecture.build(Normalizer.from_coordinates(architecture.coordinates, tiny.REST), None).eval()
     assert (model.count_parameters(), latency.count_macs(model)) == PUBLISHED[name]
 
 

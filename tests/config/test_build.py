@@ -160,7 +160,7 @@ def network(overrides: list[str]) -> MemMLP:
     torch.manual_seed(0)
     architecture = build_experiment(compose_config(overrides)).architecture
     codes = architecture.vqvae() if architecture.uses_codes else None
-    model = architecture.build(Normalizer.raw(architecture.coordinates, tiny.REST), codes)
+    model = architecture.build(Normalizer.from_coordinates(architecture.coordinates, tiny.REST), codes)
     for name, buffer in model.named_buffers():
         if name.endswith("codebook.vectors"):
             buffer.normal_()

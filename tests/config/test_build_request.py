@@ -15,7 +15,7 @@ from memmlp.config.build import build_experiment
 from memmlp.config.build_request import build_motion
 from memmlp.config.compose import compose_config
 from memmlp.config.schema import restore_config
-from memmlp.motion.preparing.find_clips import Folders
+from memmlp.motion.preparing.find_clips import NamedFolders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
 MIX = {
@@ -51,7 +51,7 @@ def test_a_list_of_one_folder_is_that_folder():
 
 def test_a_list_of_folders_names_sources_after_them():
     source = build_motion(compose_config(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).clips
-    assert source.root == Folders({"b": Path("b"), "a": Path("a")})
+    assert source.root == NamedFolders({"b": Path("b"), "a": Path("a")})
     assert isinstance(source.split, MixedSplit)
     assert {split.test for split in source.split.splits.values()} == {0.2}
     with pytest.raises(InputError, match=r"data\.root"):

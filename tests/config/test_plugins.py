@@ -164,7 +164,7 @@ def test_a_metric_is_measured_in_both_branches(on_path: Path):
     assert {"Mean", "Turn"} <= report["rotation"].keys()
     assert "Mean" in report["position"]
     assert "Turn" not in report["position"]
-    assert {"rotation Mean", "position Mean"} <= measure_stream(model(), frames().clips(), own).keys()
+    assert {"rotation Mean", "position Mean"} <= measure_stream(model(), frames().read_clips(), own).keys()
     wrong = {"Mean": UserMetric(lambda p, t: p, "positions")}
     with pytest.raises(InputError, match=r"metric Mean"):
         Evaluation(["stream"], 4, NoIK(), 0, wrong).report(model(), frames(), "stream")

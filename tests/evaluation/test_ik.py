@@ -29,7 +29,7 @@ def perturbed(size: float, seed: int = 0) -> Tensor:
 def distance(motion: Tensor) -> Tensor:
     """Return the largest distance (N,) of a joint by the rotations from that by the positions, cm."""
     target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
-    return 100 * (NORMALIZER.pose(motion, SPARSE[: len(motion)]) - target).norm(dim=-1).amax(-1)
+    return 100 * (NORMALIZER.compute_positions(motion, SPARSE[: len(motion)]) - target).norm(dim=-1).amax(-1)
 
 
 def objective(motion: Tensor) -> JointDistance:
@@ -66,7 +66,7 @@ def test_the_objective_is_the_distance_that_is_measured():
     """It is the sum of squares over joints, the head on its tracker, as by `Normalizer.pose`."""
     motion = perturbed(0.3)
     target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
-    expected = (NORMALIZER.pose(motion, SPARSE) - target).square().sum((1, 2))
+    expected = (NORMALIZER.compute_positions(motion, SPARSE) - target).square().sum((1, 2))
     rows = torch.arange(len(motion))
     value = objective(motion)(torch.zeros(len(motion), 66, dtype=torch.float64), rows)
     torch.testing.assert_close(value.float(), expected, rtol=1e-4, atol=1e-6)

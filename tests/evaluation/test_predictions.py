@@ -26,7 +26,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.clip import Clip
 from memmlp.motion.exporting import plan_export
 from memmlp.motion.formats.npz import read_clip, write_clip
-from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, motion_frames
+from memmlp.motion.geometry import axis_angle_to_matrix, compute_motion_frames, forward_kinematics
 
 NETWORK = model()
 BODY = REST.numpy()
@@ -46,7 +46,7 @@ def source(length: int, seed: int = 0, fps: float = 60.0) -> Clip:
 
 
 def frames(clip: Clip) -> torch.Tensor:
-    return motion_frames(torch.tensor(clip.poses), torch.tensor(clip.trans), REST).float()
+    return compute_motion_frames(torch.tensor(clip.poses), torch.tensor(clip.trans), REST).float()
 
 
 def joints(clip: Clip) -> np.ndarray:

@@ -26,12 +26,12 @@ from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.tracker_resampling import GAP
-from memmlp.motion.body import PARENTS, builtin_rest_joints
+from memmlp.motion.body import PARENTS, make_builtin_rest_joints
 
 pytestmark = pytest.mark.slow
 
 SPACE = SPACES["unity"]
-REST = builtin_rest_joints() * SPACE.body
+REST = make_builtin_rest_joints() * SPACE.body
 Rows = list[tuple[float, np.ndarray, str]]  # a time, trackers (3, 7) with NaN where lost, a word
 
 

@@ -23,12 +23,12 @@ from memmlp.common.errors import InputError
 from memmlp.live.outputs import VMC, Outputs, Receiver, Recorder, VRChat, compute_euler_angles, place_trackers
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import BodyFrame, Stream
-from memmlp.motion.body import JOINTS, N_JOINTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, N_JOINTS, make_builtin_rest_joints
 from memmlp.motion.formats.gltf import UNITY_BONES
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of a person in AMASS' world who looks along -Y
 AROUND = Rotation.from_euler("y", 180, degrees=True).as_matrix()  # so that the person looks along Unity's +Z
 ETHERNET = 1472  # bytes of a datagram that is not split

@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from memmlp.live.rotations import BodyTree, rotate_by_fraction, sixd_to_matrix, slerp
 from memmlp.motion import geometry
-from memmlp.motion.body import HEAD, JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.body import HEAD, JOINTS, PARENTS, make_builtin_rest_joints
 
 LOCAL = Rotation.random(22, rng=0).as_matrix()
 
 
 def test_gram_schmidt_and_forward_kinematics_are_those_of_torch():
-    sixd, rest = np.random.default_rng(0).normal(size=(22, 6)), builtin_rest_joints()
+    sixd, rest = np.random.default_rng(0).normal(size=(22, 6)), make_builtin_rest_joints()
     expected = geometry.sixd_to_matrix(torch.tensor(sixd)).numpy()
     np.testing.assert_allclose(sixd_to_matrix(sixd), expected, atol=1e-12)
     root = torch.zeros(3).double()

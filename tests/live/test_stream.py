@@ -64,7 +64,7 @@ def test_inverse_kinematics_bring_the_pose_to_the_position_branch(network, file)
     frames = PERSON.frames[:19]
     motion = predict_stream(network, [frames])[0]
     expected = LBFGS().solutions(network.normalizer, motion, frames[:, :SPARSE_DIM])["combined"]
-    there = network.normalizer.pose(expected, frames[:, :SPARSE_DIM]).numpy()
+    there = network.normalizer.compute_positions(expected, frames[:, :SPARSE_DIM]).numpy()
     assert wearer.apart(wearer.joints(solved[1:]), there).max() < 0.1
 
 
@@ -76,7 +76,7 @@ def largest_difference(network, file: Path, person: wearer.Person) -> float:
     poses = wearer.play(Stream(file), person.positions, person.rotations)[1:]
     motion = predict_stream(network, [person.frames])[0]
     pairs = [
-        (wearer.joints(poses), network.normalizer.pose(motion, person.frames[:, :SPARSE_DIM])),
+        (wearer.joints(poses), network.normalizer.compute_positions(motion, person.frames[:, :SPARSE_DIM])),
         (np.stack([pose.position_branch for pose in poses]), extract_positions(motion)),
         (np.stack([pose.rotations for pose in poses]), extract_rotations(motion)),
     ]

@@ -25,9 +25,9 @@ from memmlp.live.wearer import (
     read_calibration,
     save_calibration,
 )
-from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 BODY = BodyTree(JOINTS, PARENTS, REST)
 PERSON = moving.person(np.arange(40) / 60)
 HEIGHT, FLOOR = 1.95, 0.4
@@ -76,7 +76,7 @@ def test_a_tall_wearer_on_a_raised_floor_moves_as_the_network_s_body(name: str, 
         np.testing.assert_allclose(
             quaternion_to_matrix(pose.rotations), space.convert_pose_from_amass(here.rotations), atol=1e-4
         )
-    np.testing.assert_allclose(tall.rest, builtin_rest_joints() * SIZE)
+    np.testing.assert_allclose(tall.rest, make_builtin_rest_joints() * SIZE)
 
 
 @pytest.mark.slow

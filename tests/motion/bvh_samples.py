@@ -14,13 +14,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import Bvh, read_bvh
 from memmlp.motion.formats.recording import END
 from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 # Joint, parent, offset; a * before an end site's joint, which comes with the offset only.
 DAZ = """
 hip - 0 0 0; abdomen hip 0 20.7 -0.7; chest abdomen 0 11.7 -0.5; neck chest 0 22.2 -2.2; head neck -0.2

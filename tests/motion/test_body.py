@@ -9,9 +9,15 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.motion.body import RECORD, body_name, body_record, builtin_rest_joints, check_imported_body
+from memmlp.motion.body import (
+    RECORD,
+    check_imported_body,
+    describe_body,
+    format_body_name,
+    make_builtin_rest_joints,
+)
 
-BUILTIN, OTHER = builtin_rest_joints(), 1.1 * builtin_rest_joints()
+BUILTIN, OTHER = make_builtin_rest_joints(), 1.1 * make_builtin_rest_joints()
 
 
 @pytest.mark.parametrize("folder", [".", "walk", "walk/deep"])
@@ -21,7 +27,7 @@ def test_clips_of_an_import_are_used_on_its_body(tmp_path: Path, folder: str):
     record = tmp_path / folder / RECORD
     for rest in (BUILTIN, OTHER):
         check_imported_body(clips, rest, "data.body")  # nobody's import
-    write_json(record, body_record("model.npz", OTHER))
+    write_json(record, describe_body("model.npz", OTHER))
     check_imported_body(clips, OTHER.astype(np.float32).astype(np.float64), "data.body")
     with pytest.raises(InputError, match=r"model\.npz.*data\.body"):
         check_imported_body(clips, BUILTIN, "data.body")
@@ -34,7 +40,7 @@ def test_records_of_other_programs_are_ignored(tmp_path: Path, text: str):
 
 
 def test_bodies_of_models_are_told_apart_by_a_digest():
-    assert body_name("builtin", BUILTIN) == "builtin"
-    names = {body_name("a/model.npz", BUILTIN), body_name("b/model.npz", OTHER)}
+    assert format_body_name("builtin", BUILTIN) == "builtin"
+    names = {format_body_name("a/model.npz", BUILTIN), format_body_name("b/model.npz", OTHER)}
     assert len(names) == 2
     assert all(name.startswith("model.npz ") for name in names)

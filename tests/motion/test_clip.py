@@ -11,8 +11,8 @@ from memmlp.motion.clip import (
     RARE_RATES,
     USUAL_RATES,
     Clip,
+    find_nearest_rate,
     is_known_rate,
-    nearest_rate,
     resample,
 )
 
@@ -95,7 +95,7 @@ def test_a_jump_stays_one():
 def test_pieces_are_the_clip():
     poses, trans = analytic(np.arange(7.0))
     for frames, lengths in ((3, [3, 3, 1]), (7, [7]), (100, [7])):
-        pieces = list(Clip("clip", poses, trans, 60.0).pieces(frames))
+        pieces = list(Clip("clip", poses, trans, 60.0).split_into_pieces(frames))
         assert [len(piece) for piece in pieces] == lengths
         np.testing.assert_array_equal(np.concatenate([piece.poses for piece in pieces]), poses)
         np.testing.assert_array_equal(np.concatenate([piece.trans for piece in pieces]), trans)
@@ -106,4 +106,4 @@ def test_rates_of_cameras_and_of_video_are_known_and_those_of_cut_off_frame_time
     assert all(map(is_known_rate, rates))
     for time, usual in ((0.016, 60), (0.008, 120), (0.03, 30)):
         assert not is_known_rate(1 / time)
-        assert nearest_rate(1 / time) == usual
+        assert find_nearest_rate(1 / time) == usual

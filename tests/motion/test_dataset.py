@@ -8,7 +8,7 @@ from plain_body import posed
 
 from memmlp.motion.body import FRAME_DIM, JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler, mirror_frames
-from memmlp.motion.geometry import motion_frames
+from memmlp.motion.geometry import compute_motion_frames
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def frames() -> MotionDataset:
 
 
 def test_stretches_end_where_asked_and_repeat_the_first_frame(frames):
-    stretches = frames.stretches(torch.tensor([0, 1, 2]), torch.tensor([2, 11, 29]), 4)[..., 0]
+    stretches = frames.read_stretches(torch.tensor([0, 1, 2]), torch.tensor([2, 11, 29]), 4)[..., 0]
     assert stretches.tolist() == [[0, 0, 1, 2], [13, 14, 15, 16], [43, 44, 45, 46]]
 
 
@@ -66,7 +66,8 @@ def test_it_is_what_a_person_of_mirrored_angles_gives():
         other[:, joint] = poses[:, JOINTS.index(twin)] * [1, -1, -1]
     pairs = ((poses, trans), (other, trans * [-1, 1, 1]))
     plain, expected = (
-        motion_frames(torch.tensor(turns), torch.tensor(moved), tiny.REST.double()) for turns, moved in pairs
+        compute_motion_frames(torch.tensor(turns), torch.tensor(moved), tiny.REST.double())
+        for turns, moved in pairs
     )
     assert plain.shape[-1] == FRAME_DIM
     torch.testing.assert_close(mirror_frames(plain), expected, atol=1e-9, rtol=0)
@@ -78,12 +79,12 @@ def test_a_mirrored_dataset_has_each_clip_twice_and_its_frames_once():
     assert both.frames is plain.frames
     assert both.names == ["clip0", "clip1", "clip0 (mirrored)", "clip1 (mirrored)"]
     assert both.groups == [*plain.groups, *plain.groups]
-    for index, clip in enumerate(both.clips()):
-        expected = plain.clip(index % 2)
+    for index, clip in enumerate(both.read_clips()):
+        expected = plain.read_clip(index % 2)
         assert torch.equal(clip, mirror_frames(expected) if index > 1 else expected)
-    drawn = both.stretches(torch.arange(4), torch.full((4,), 9), 5)
+    drawn = both.read_stretches(torch.arange(4), torch.full((4,), 9), 5)
     for index, segment in enumerate(drawn):
-        expected = plain.clip(index % 2)[5:10]
+        expected = plain.read_clip(index % 2)[5:10]
         assert torch.equal(segment, mirror_frames(expected) if index > 1 else expected)
 
 

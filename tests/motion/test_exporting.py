@@ -10,13 +10,13 @@ import pytest
 from conftest import Memmlp, one_line
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import RECORD, body_record, builtin_rest_joints
+from memmlp.motion.body import RECORD, describe_body, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.exporting import FORMATS, export, format_of, plan_export, write_motion
+from memmlp.motion.exporting import FORMATS, export, find_format, plan_export, write_motion
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import write_clip
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 
 
 def moving(seed: int, fps: float = 120.0) -> Clip:
@@ -67,16 +67,18 @@ def test_a_clip_keeps_its_rate_or_gets_another(folder: Path, tmp_path: Path):
     export(plan_export(folder / "walk.npz", tmp_path / "new" / "half.BVH"), fps=60)
     own, half = read_bvh(tmp_path / "own.bvh"), read_bvh(tmp_path / "new" / "half.BVH")
     assert (own.fps, len(own), half.fps, len(half)) == (120, 5, 60, 3)
-    np.testing.assert_allclose(half.kinematics()[1], own.kinematics()[1][::2], atol=1e-4)  # cm
+    np.testing.assert_allclose(
+        half.compute_kinematics()[1], own.compute_kinematics()[1][::2], atol=1e-4
+    )  # cm
 
 
 def test_clips_of_an_import_are_exported_on_its_body(folder: Path, tmp_path: Path):
-    (folder / RECORD).write_text(json.dumps(body_record("model.npz", 1.1 * REST)))
+    (folder / RECORD).write_text(json.dumps(describe_body("model.npz", 1.1 * REST)))
     for source, out, name in ((folder, "out", "bvh"), (folder / "walk.npz", "walk.glb", None)):
         with pytest.raises(InputError, match=rf"^{folder.resolve()}: .*model\.npz.*--body"):
             export(plan_export(source, tmp_path / out, name))
     export(plan_export(folder / "walk.npz", tmp_path / "walk.npz"), fps=30)  # has no bones
-    (folder / RECORD).write_text(json.dumps(body_record("builtin", REST)))
+    (folder / RECORD).write_text(json.dumps(describe_body("builtin", REST)))
     export(plan_export(folder / "walk.npz", tmp_path / "walk.glb"))
 
 
@@ -111,8 +113,8 @@ def test_unclear_or_dangerous_targets_are_refused(folder: Path):
         ("walk.npz", "walk.npz", None, "--out", "source"),
         (".", "../a", None, "--format", "bvh, npz, gltf"),
         (".", "../a.bvh", "bvh", "--out", "must be a folder"),
-        (".", "below", "npz", "--out", "a folder beside it"),
-        ("dance", ".", "npz", "--out", "a folder beside it"),
+        (".", "below", "npz", "--out", "a separate folder"),
+        ("dance", ".", "npz", "--out", "a separate folder"),
         ("empty", "../a", "npz", "no npz"),
     ):
         with pytest.raises(InputError) as error:
@@ -125,7 +127,7 @@ def test_unclear_or_dangerous_targets_are_refused(folder: Path):
 def test_a_place_that_cannot_be_written_is_named(folder: Path):
     path = folder / "walk.npz" / "a.glb"
     with pytest.raises(InputError, match="cannot be written"):
-        write_motion(path, moving(0), REST, format_of(path))
+        write_motion(path, moving(0), REST, find_format(path))
 
 
 # The command
@@ -161,6 +163,6 @@ def test_pieces_leave_no_seam(name: str, tmp_path: Path, monkeypatch: pytest.Mon
     whole, parted = (tmp_path / f"{kind}{chosen.suffix}" for kind in ("whole", "parted"))
     write_motion(whole, spinning(), REST, chosen)
     for frames in (1, 49):
-        monkeypatch.setattr(Clip.pieces, "__defaults__", (frames,))
+        monkeypatch.setattr(Clip.split_into_pieces, "__defaults__", (frames,))
         write_motion(parted, spinning(), REST, chosen)
         assert parted.read_bytes() == whole.read_bytes()

@@ -10,9 +10,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion import geometry
-from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.geometry import clip_kinematics, one_thread
+from memmlp.motion.geometry import compute_clip_kinematics, limit_to_one_thread
 
 ANGLES = (0.0, 1e-9, 1e-7, 1e-3, 1.0, 3.0, math.pi - 1e-4, math.pi - 1e-7, 10.0)
 
@@ -59,7 +59,7 @@ def test_geodesic_angle():
     a = torch.tensor(Rotation.random(50, rng=2).as_matrix())
     for angle in (0.0, 1e-6, math.pi):
         b = a @ geometry.axis_angle_to_matrix(vectors(angle))
-        np.testing.assert_allclose(geometry.geodesic_angle(a, b).numpy(), angle, atol=1e-7)
+        np.testing.assert_allclose(geometry.compute_geodesic_angle(a, b).numpy(), angle, atol=1e-7)
 
 
 def test_forward_kinematics_is_a_recursion():
@@ -82,7 +82,7 @@ def test_forward_kinematics_is_a_recursion():
 
 
 def test_the_built_in_body_is_a_person():
-    rest = dict(zip(JOINTS, builtin_rest_joints(), strict=True))
+    rest = dict(zip(JOINTS, make_builtin_rest_joints(), strict=True))
     assert (
         rest["head"][1] > rest["neck"][1] > rest["pelvis"][1] > rest["left_knee"][1] > rest["left_ankle"][1]
     )
@@ -98,11 +98,11 @@ def test_the_built_in_body_is_a_person():
 
 def test_a_body_that_is_turned_about_its_pelvis():
     """By a right angle about X in its second frame; the pelvis alone keeps its offset unturned."""
-    rest = builtin_rest_joints() + np.array([0.1, 0.2, 0.3])
+    rest = make_builtin_rest_joints() + np.array([0.1, 0.2, 0.3])
     poses = np.zeros((2, 22, 3))
     poses[1, 0, 0] = np.pi / 2
     trans = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
-    rotations, positions = clip_kinematics(Clip("turned", poses, trans, 60.0), rest)
+    rotations, positions = compute_clip_kinematics(Clip("turned", poses, trans, 60.0), rest)
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     np.testing.assert_allclose(
         rotations, np.stack([np.tile(each, (22, 1, 1)) for each in (np.eye(3), turn)]), atol=1e-7
@@ -114,7 +114,7 @@ def test_a_body_that_is_turned_about_its_pelvis():
 def test_one_thread_and_then_as_many_as_before() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    with one_thread():
+    with limit_to_one_thread():
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == 2
     torch.set_num_threads(before)

@@ -40,7 +40,7 @@ def listed(root: Path, **changes) -> MotionSource:
 
 def test_a_whole_list_is_whole_under_later_names(root):
     manifest = listed(root).prepare().manifest
-    assert manifest.coverage.whole
+    assert manifest.coverage.is_complete
     assert manifest.coverage.counts == (8, 8)
     assert (manifest.missing, manifest.listed) == ((), {"CMU": 4, "MPI_HDM05": 4})
     assert len(manifest.clips) == 8
@@ -59,12 +59,12 @@ def test_one_missing_clip_is_said_before_any_is_read(root, monkeypatch):
     assert manifest.missing == ("MPI_HDM05/02/take_poses",)
     with pytest.raises(InputError, match="1 of 8"):
         listed(root).prepare()  # though its cache is finished
-    assert listed(root).digest() == manifest.digest  # tables find what was trained on it
+    assert listed(root).find_digest() == manifest.digest  # tables find what was trained on it
 
 
 def test_a_damaged_clip_is_missing_and_one_that_is_too_short_is_not(root):
     write_clip(root / f"{NAMES[0]}_stageii.npz", still(20))
-    assert listed(root).prepare().manifest.coverage.whole
+    assert listed(root).prepare().manifest.coverage.is_complete
     (root / f"{NAMES[1]}_stageii.npz").write_bytes(b"PK broken")
     with pytest.raises(InputError, match=r"1 of 8 .*\(CMU 1 of 4\)"):
         listed(root).prepare()
@@ -78,8 +78,8 @@ def test_a_missing_subset_is_said_and_a_seeded_split_has_no_list(root):
 
     with pytest.raises(InputError, match=r"1 of 3 .*\(SFU 1 of 1\)"):
         source(SubsetSplit(["CMU", "SFU"], ["MPI_HDM05"])).prepare()
-    assert source(SubsetSplit(["CMU"], ["MPI_HDM05"])).prepare().manifest.coverage.whole
-    assert source(SeededSplit()).prepare().manifest.coverage.whole
+    assert source(SubsetSplit(["CMU"], ["MPI_HDM05"])).prepare().manifest.coverage.is_complete
+    assert source(SeededSplit()).prepare().manifest.coverage.is_complete
 
 
 def test_a_column_file_has_a_cache_of_its_own_and_names_the_groups(root):

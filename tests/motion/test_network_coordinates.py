@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 
-from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM, builtin_rest_joints
-from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_axis_angle, motion_frames
+from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM, make_builtin_rest_joints
+from memmlp.motion.geometry import axis_angle_to_matrix, compute_motion_frames, matrix_to_axis_angle
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 
-REST = torch.tensor(builtin_rest_joints(), dtype=torch.float64)
+REST = torch.tensor(make_builtin_rest_joints(), dtype=torch.float64)
 
 
 def motion(yaw: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)) -> torch.Tensor:
@@ -22,7 +22,7 @@ def motion(yaw: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)) -> torch.T
     root = turn @ upright @ axis_angle_to_matrix(poses[:, 0])
     poses[:, 0] = matrix_to_axis_angle(root)
     trans = torch.randn(21, 3, generator=draw, dtype=torch.float64) @ turn.T
-    return motion_frames(poses, trans + torch.tensor([*shift, 0.0]), REST).float()
+    return compute_motion_frames(poses, trans + torch.tensor([*shift, 0.0]), REST).float()
 
 
 @pytest.mark.parametrize("coordinates", [World(), HeadRelative(), Heading()])
@@ -30,7 +30,7 @@ def test_there_and_back(coordinates):
     frames = motion(yaw=2.0, shift=(3.0, -1.0))
     normalizer = Normalizer.fit(coordinates, REST, frames)
     sparse, theta = frames[:, :SPARSE_DIM], frames[:, SPARSE_DIM:]
-    origin = normalizer.origin(sparse)
+    origin = normalizer.find_origin(sparse)
     torch.testing.assert_close(
         normalizer.decode_motion(normalizer.encode_motion(theta, origin), origin), theta, atol=1e-5, rtol=0
     )
@@ -42,7 +42,7 @@ def test_there_and_back(coordinates):
     [(World(), False, False), (HeadRelative(), True, False), (Heading(), True, True)],
 )
 def test_what_it_is_blind_to(coordinates, blind_to_place, blind_to_heading):
-    normalizer = Normalizer.raw(coordinates, REST)
+    normalizer = Normalizer.from_coordinates(coordinates, REST)
     here = normalizer.encode(motion())
     assert torch.allclose(here, normalizer.encode(motion(shift=(5.0, 2.0))), atol=1e-4) == blind_to_place
     assert torch.allclose(here, normalizer.encode(motion(yaw=1.3)), atol=1e-4) == blind_to_heading
@@ -51,7 +51,7 @@ def test_what_it_is_blind_to(coordinates, blind_to_place, blind_to_heading):
 def test_statistics_are_those_of_the_training_frames():
     frames = motion()
     encoded = Normalizer.fit(HeadRelative(), REST, frames, chunk=7).encode(frames)
-    varies = Normalizer.raw(HeadRelative(), REST).encode(frames).std(0, unbiased=False) > 1e-3
+    varies = Normalizer.from_coordinates(HeadRelative(), REST).encode(frames).std(0, unbiased=False) > 1e-3
     torch.testing.assert_close(encoded.mean(0), torch.zeros(FRAME_DIM), atol=1e-3, rtol=0)
     torch.testing.assert_close(
         encoded.std(0, unbiased=False)[varies], torch.ones(int(varies.sum())), atol=1e-3, rtol=0
@@ -60,7 +60,7 @@ def test_statistics_are_those_of_the_training_frames():
 
 def test_pose_puts_the_head_on_its_tracker():
     frames = motion()
-    normalizer = Normalizer.raw(World(), REST)
-    positions = normalizer.pose(frames[:, SPARSE_DIM:], frames[:, :SPARSE_DIM])
+    normalizer = Normalizer.from_coordinates(World(), REST)
+    positions = normalizer.compute_positions(frames[:, SPARSE_DIM:], frames[:, :SPARSE_DIM])
     truth = frames[:, SPARSE_DIM:][:, ROTATION.stop :].unflatten(-1, (22, 3))
     torch.testing.assert_close(positions, truth, atol=1e-5, rtol=0)

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, geodesic_angle
+from memmlp.motion.geometry import axis_angle_to_matrix, compute_geodesic_angle, forward_kinematics
 from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
 
 FPS = 60.0
@@ -30,7 +30,7 @@ def performed(activity: str, seed: int = 0) -> tuple[Clip, torch.Tensor, torch.T
     """Make a clip; return it with its local and global rotations and its joints' positions."""
     clip = synthesize_clip(activity, seed, seconds=12.0, fps=FPS)
     local = axis_angle_to_matrix(torch.from_numpy(clip.poses).double())
-    rest = torch.from_numpy(builtin_rest_joints())
+    rest = torch.from_numpy(make_builtin_rest_joints())
     rotations, positions = forward_kinematics(local, torch.from_numpy(clip.trans).double(), rest)
     return clip, local, rotations, positions.numpy()
 
@@ -128,7 +128,7 @@ def test_motion_is_smooth_and_within_the_range_of_a_person(activity):
     assert joint(clip.poses, "right_elbow")[:, 1].min() > 0.0
     assert (joint(positions, "head")[:, 2] > joint(positions, "pelvis")[:, 2] + 0.3).all()
     assert (rotations[:, 0, 2, 1] > 0.3).all()  # the pelvis is upright
-    assert geodesic_angle(local[1:], local[:-1]).max() < BRISK.get(activity, 0.35)
+    assert compute_geodesic_angle(local[1:], local[:-1]).max() < BRISK.get(activity, 0.35)
     jitter = np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1).mean() * FPS**3 / 100
     assert jitter < JITTER.get(activity, 5.0)
 

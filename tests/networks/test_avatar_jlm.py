@@ -17,7 +17,7 @@ def test_tracked_joints_stand_in_the_tokens_as_they_are():
     seen = {}
     model.position_token.register_forward_hook(lambda _, given, made: seen.update(position=given[0]))
     model.rotation_token.register_forward_hook(lambda _, given, made: seen.update(rotation=given[0]))
-    encoded = model.normalizer.encode_sparse(SPARSE.double(), model.normalizer.origin(SPARSE.double()))
+    encoded = model.normalizer.encode_sparse(SPARSE.double(), model.normalizer.find_origin(SPARSE.double()))
     model.make_tokens(encoded)
     joints, turns = model.place_coarse_joints(model.embedding(avatar_jlm.spread_over_joints(encoded)))
     true = SPARSE[..., 36:45].unflatten(-1, (3, 3)).double()
@@ -34,7 +34,7 @@ def test_the_inputs_token_is_renewed_and_teaches_the_embedding_nothing():
     model, seen = tiny.baseline("avatar_jlm"), []
     for layer in model.layers:
         layer.register_forward_hook(lambda _, given, made: seen.append(given[0]))
-    encoded = model.normalizer.encode_sparse(SPARSE, model.normalizer.origin(SPARSE))
+    encoded = model.normalizer.encode_sparse(SPARSE, model.normalizer.find_origin(SPARSE))
     model.predict_rotations(encoded)
     first = seen[0].unflatten(0, (2, 7))[:, :, -1]
     for index, h in enumerate(seen):

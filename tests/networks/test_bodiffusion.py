@@ -50,7 +50,7 @@ def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypat
     sparse = CLIP[:, :SPARSE_DIM].double()
     noise = torch.randn(2, 25, 132, generator=torch.Generator().manual_seed(0)).double()
     found = model.predict_clip(sparse)
-    encoded = model.normalizer.encode_sparse(sparse, model.normalizer.origin(sparse))
+    encoded = model.normalizer.encode_sparse(sparse, model.normalizer.find_origin(sparse))
     x = noise[0]
     for index in range(2):
         sums, variances, covered = torch.zeros_like(x), torch.zeros_like(x), torch.zeros(25, 1)
@@ -61,7 +61,7 @@ def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypat
             variances[part] += variance[0]
             covered[part] += 1
         x = sums / covered + (variances.sqrt() / covered * noise[1] if index == 0 else 0)
-    torch.testing.assert_close(found, model.normalizer.posed(x, sparse), atol=1e-9, rtol=0)
+    torch.testing.assert_close(found, model.normalizer.decode_rotations(x, sparse), atol=1e-9, rtol=0)
 
 
 @torch.no_grad()

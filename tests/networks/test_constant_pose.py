@@ -48,7 +48,11 @@ def test_the_pose_is_the_same_and_the_head_where_its_tracker_is(model: ConstantP
 @pytest.mark.parametrize("normalize", [True, False])
 def test_its_first_gradient_is_that_of_rotations(normalize: bool):
     """Zeros are no rotation, and the gradient of one made of them is 1e12 times that of another."""
-    made = Normalizer.fit(Heading(), tiny.REST, CLIP) if normalize else Normalizer.raw(Heading(), tiny.REST)
+    made = (
+        Normalizer.fit(Heading(), tiny.REST, CLIP)
+        if normalize
+        else Normalizer.from_coordinates(Heading(), tiny.REST)
+    )
     model = ConstantPose(made, ConstantPoseSettings(frames=7))
     motion = model.training_call(CLIP[None, :7, :SPARSE_DIM], {}, CLIP[None, :7]).motion
     (rotations(motion) * torch.rand(22, 3, 3)).sum().backward()
@@ -64,7 +68,7 @@ def test_it_turns_with_the_head_and_with_nothing_else(model: ConstantPose):
     torch.testing.assert_close(
         turns[:, 2], torch.tensor([0.0, 0.0, 1.0]).expand(len(CLIP), -1), atol=1e-5, rtol=0
     )
-    cos, sin = model.normalizer.origin(CLIP[:, :SPARSE_DIM])[:, 3:].unbind(-1)
+    cos, sin = model.normalizer.find_origin(CLIP[:, :SPARSE_DIM])[:, 3:].unbind(-1)
     torch.testing.assert_close(turns[:, 0, 0], cos * cos[0] + sin * sin[0], atol=1e-5, rtol=0)
     assert turns[:, 0, 0].min() < 1 - 1e-5  # it does turn
 

@@ -38,9 +38,9 @@ def posed_globally(motion: torch.Tensor) -> torch.Tensor:
 @torch.no_grad()
 def test_the_true_parts_make_the_true_trunk_hands_and_ankles():
     """And the head and wrists have their trackers' rotations; elbows and knees may reach a limit of twist."""
-    normalizer = Normalizer.raw(World(), tiny.REST).double()
+    normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
     rotation = PredictedParts.from_outputs(outputs(), normalizer).solve_pose(SPARSE, normalizer)
-    motion = normalizer.posed(rotation, SPARSE)
+    motion = normalizer.decode_rotations(rotation, SPARSE)
     made, true = (part[..., POSITION].unflatten(-1, (22, 3)) for part in (motion, MOTION))
     trunk = [0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17]
     torch.testing.assert_close(made[..., trunk, :], true[..., trunk, :], atol=1e-5, rtol=0)
@@ -65,7 +65,7 @@ def filled(sixd: np.ndarray) -> np.ndarray:
 def test_manikin_s_losses_are_an_independent_computation():
     """In NumPy, limb by limb, with the weights of its authors."""
     model = tiny.baseline("manikin_s", World()).double()
-    normalizer = Normalizer.raw(World(), tiny.REST).double()
+    normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
     model.normalizer = normalizer
     made = (
         outputs()[:, -1:] + 0.1 * torch.randn(2, 1, 86, generator=torch.Generator().manual_seed(1)).double()
@@ -130,7 +130,7 @@ def test_manikin_s_standing_legs_teach_without_bound_nothing():
 
 def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_way():
     model = tiny.baseline("manikin_l", World()).double()
-    model.normalizer = Normalizer.raw(World(), tiny.REST).double()
+    model.normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
     auxiliary = MOTION[..., ROTATION][..., 6:]
     made = torch.cat([outputs(), auxiliary], -1)
     true = TrueParts(MOTION)
@@ -150,14 +150,14 @@ def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_w
 def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_back(name, monkeypatch):
     """Each window by its own; in coordinates of the heading it makes no difference at all."""
     model, seen = tiny.baseline(name, Heading()).double(), []
-    model.normalizer = Normalizer.raw(Heading(), tiny.REST).double()
+    model.normalizer = Normalizer.from_coordinates(Heading(), tiny.REST).double()
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[[0.1]], [[0.7]]]).double())
     state = model.initial_state(2)
     expected = model.advance(SPARSE, state)[0]
     motion, *_ = model.training_call(SPARSE, state, TRUTH)
     torch.testing.assert_close(motion, expected[:, -motion.shape[1] :], atol=1e-6, rtol=0)
     world = tiny.baseline(name, World()).double()
-    world.normalizer = Normalizer.raw(World(), tiny.REST).double()
+    world.normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
     predicted = world.predict_parts
     world.predict_parts = lambda encoded: (seen.append(encoded), predicted(encoded))[1]
     world.training_call(SPARSE, state, TRUTH)

@@ -5,7 +5,7 @@ import tiny
 import torch
 
 from memmlp.evaluation.modes import predict_windows
-from memmlp.motion.body import MOTION_DIM, SPARSE_DIM, builtin_rest_joints
+from memmlp.motion.body import MOTION_DIM, SPARSE_DIM, make_builtin_rest_joints
 from memmlp.motion.dataset import WindowSampler
 from memmlp.motion.network_coordinates import HeadRelative
 from memmlp.motion.normalizer import Normalizer
@@ -37,7 +37,7 @@ def test_paper_profile_has_the_papers_parameters():
     read = {"fusion": "residual", "shift": "window", "history": "first"}
     keys = CodeMemorySettings(layers=[2, 4, 6, 8], width=192, **read)
     memory = CodeMemory(keys, codes=VQVAE(), depth=8, **sizes)
-    normalizer = Normalizer.raw(HeadRelative(), torch.tensor(builtin_rest_joints()))
+    normalizer = Normalizer.from_coordinates(HeadRelative(), torch.tensor(make_builtin_rest_joints()))
     model = MemMLP(normalizer, memory, TwoBranch(TwoBranchSettings(2), **sizes), depth=8, **sizes)
     assert model.count_parameters() == 4_117_118
     assert abs(model.count_parameters() / 4.10e6 - 1) < 0.03
@@ -53,7 +53,7 @@ def test_memory_sees_the_shifted_past(shift):
     outputs = run(model, SPARSE)
     back, size, t = {"frame": 1, "window": model.frames}[shift], model.frames, 30
     span = slice(t - back - size + 1, t - back + 1)
-    origin = model.normalizer.origin(SPARSE)
+    origin = model.normalizer.find_origin(SPARSE)
     torch.testing.assert_close(seen[t].sparse, model.normalizer.encode_sparse(SPARSE, origin)[:, span])
     own = torch.stack([output[0, -1] for output in outputs])[None]
     torch.testing.assert_close(
@@ -70,7 +70,7 @@ def test_the_past_of_a_call_of_a_window_is_the_window_before(shift):
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
     size, sparse = model.frames, SPARSE[:, : 3 * model.frames]
     outputs = run(model, sparse, new=size)
-    origin = model.normalizer.origin(sparse)[:, size : 2 * size]
+    origin = model.normalizer.find_origin(sparse)[:, size : 2 * size]
     before = model.normalizer.encode_sparse(sparse[:, size : 2 * size], origin)
     torch.testing.assert_close(seen[2].sparse, before)
     torch.testing.assert_close(

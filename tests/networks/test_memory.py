@@ -54,7 +54,7 @@ def test_the_recurrent_feature_is_norm_layer_silu_over_the_whole_stream(kind):
     seen = []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
     outputs(model, SPARSE, 1)
-    encoded = model.normalizer.encode_sparse(SPARSE, model.normalizer.origin(SPARSE))
+    encoded = model.normalizer.encode_sparse(SPARSE, model.normalizer.find_origin(SPARSE))
     first = model.memory.recurrences[0]
     expected = torch.nn.functional.silu(first.layer(first.norm(encoded))[0])
     block = model.blocks[1]
@@ -67,8 +67,8 @@ def test_teacher_forcing_starts_the_hidden_state_from_the_input_before_the_windo
     sampler = WindowSampler(SPLIT, batch=5, window=7, seed=0)
     call = TeacherForcing().draw(model, SPLIT, sampler, 0)
     clips, end = sampler.draw(0)
-    assert torch.equal(call.sparse, SPLIT.stretches(clips, end, 7)[..., :SPARSE_DIM])
-    before = SPLIT.stretches(clips, end - 7, 1)
+    assert torch.equal(call.sparse, SPLIT.read_stretches(clips, end, 7)[..., :SPARSE_DIM])
+    before = SPLIT.read_stretches(clips, end - 7, 1)
     encoded = model.normalizer.encode(before)[:, 0, :SPARSE_DIM]
     layer = model.memory.recurrences[1]
     torch.testing.assert_close(call.state["hidden"][:, 1], layer.first(layer.norm(encoded)))
@@ -152,8 +152,8 @@ def test_the_vqvaes_terms_are_eq_1_in_the_worlds_units_and_the_codebooks_loss():
     model.codebook.started.fill_(True)
     rotations = model.decoder(model.codebook.vectors[nearest])
     std, mean = (tensor[54:186] for tensor in (tiny.normalizer().std, tiny.normalizer().mean))
-    origin = tiny.normalizer().origin(tiny.clip(20)[:, :54])
-    truth = tiny.normalizer().coordinates.motion_in(tiny.clip(20)[:, 54:], origin)[:, :132]
+    origin = tiny.normalizer().find_origin(tiny.clip(20)[:, :54])
+    truth = tiny.normalizer().coordinates.convert_motion_to_local(tiny.clip(20)[:, 54:], origin)[:, :132]
     expected = l1((rotations * std + mean - truth)[:, None])
     terms, indices = model.compute_losses(frames, tiny.normalizer())
     torch.testing.assert_close(terms["rotation"], expected, rtol=1e-5, atol=0)

@@ -76,7 +76,7 @@ def test_calls_modes_clips_and_the_graph_are_one_stream(name: str):
     windows = modes.predict_windows(model, [SHORT, LONG])
     torch.testing.assert_close(windows[0], modes.predict_windows(model, [SHORT])[0], atol=1e-9, rtol=0)
     if "position" not in model.branches:
-        expected = model.normalizer.pose(stream, LONG[:, :SPARSE_DIM]).flatten(1)
+        expected = model.normalizer.compute_positions(stream, LONG[:, :SPARSE_DIM]).flatten(1)
         torch.testing.assert_close(stream[:, ROTATION.stop :], expected, atol=1e-9, rtol=0)
     if model.windowless:
         torch.testing.assert_close(windows[1], stream, atol=1e-9, rtol=0)

@@ -61,7 +61,7 @@ def test_a_global_head_begins_at_the_mean_pose():
     """With no hidden state its rotations are those of the normalizer's mean, seen along the heading."""
     model = tiny.recurrent_poser(Heading(), output="global")
     model.members["member1"].head.weight.zero_()
-    mean = model.normalizer.posed(torch.zeros(1, ROTATION.stop), SPARSE[0, :1])
+    mean = model.normalizer.decode_rotations(torch.zeros(1, ROTATION.stop), SPARSE[0, :1])
     made = model.pose(model.members["member1"].head(torch.zeros(1, 16)), SPARSE[0, :1])
     found, expected = (evaluation.extract_rotations(motion) for motion in (made, mean))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)

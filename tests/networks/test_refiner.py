@@ -43,7 +43,11 @@ def test_it_corrects_the_networks_stream(name):
     expected = bare[:, ROTATION] + model.head(model.layers(bare[None, :, ROTATION])[0])[0]
     torch.testing.assert_close(made[:, ROTATION], expected)
     assert not torch.allclose(made[:, ROTATION], bare[:, ROTATION], atol=1e-3)
-    positions = model.normalizer.pose(made, SPARSE[0]).flatten(1) if name != "mem_mlp" else bare[:, POSITION]
+    positions = (
+        model.normalizer.compute_positions(made, SPARSE[0]).flatten(1)
+        if name != "mem_mlp"
+        else bare[:, POSITION]
+    )
     torch.testing.assert_close(made[:, POSITION], positions)
     assert torch.equal(modes.predict_windows(model, [CLIP])[0], made)
 
@@ -57,7 +61,10 @@ def test_arms_that_it_moves_off_their_trackers_reach_again_by_inverse_kinematics
     clip[:, SPARSE_POSITION.start + 3 : SPARSE_POSITION.stop] = hands.flatten(1)
     (reaching,), (moved,) = modes.predict_stream(model.network, [clip]), modes.predict_stream(model, [clip])
     again = Arms().solutions(model.normalizer, moved, clip[:, :SPARSE_DIM])["combined"]
-    found = [model.normalizer.pose(motion, clip[:, :SPARSE_DIM]) for motion in (reaching, again, moved)]
+    found = [
+        model.normalizer.compute_positions(motion, clip[:, :SPARSE_DIM])
+        for motion in (reaching, again, moved)
+    ]
     away = [float((joints[:, list(HANDS)] - hands).norm(dim=-1).mean()) for joints in found]
     assert away[0] < 0.001
     assert away[1] < 0.02

@@ -172,7 +172,7 @@ def test_mixed_precision_computes_losses_in_float32():
         motion = made.float().requires_grad_()
         with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
             total, terms = loss(motion, truth, TRUE[..., :SPARSE_DIM], NORMALIZER)
-            posed = NORMALIZER.pose(motion, TRUE[..., :SPARSE_DIM])
+            posed = NORMALIZER.compute_positions(motion, TRUE[..., :SPARSE_DIM])
         total.backward()
         found.append((total, *terms.values(), posed, motion.grad))
     for alone, beside in zip(*found, strict=True):

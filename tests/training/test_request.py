@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
-from memmlp.motion.clip import Skipped
+from memmlp.motion.clip import SkippedFile
 from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
 from memmlp.training import request
 
@@ -16,7 +16,7 @@ def clip(name: str, split: str, fps: float = 60.0, group: str = "tied") -> Simpl
 
 def warnings(clips: list[SimpleNamespace], name: str = "mine", part: dict | None = None, **facts) -> dict:
     """The warnings on data with these clips and facts of its manifest."""
-    whole = {"coverage": SimpleNamespace(whole=True), "listed": {"CMU": 1}, "split": {}, "unusual": {}}
+    whole = {"coverage": SimpleNamespace(is_complete=True), "listed": {"CMU": 1}, "split": {}, "unusual": {}}
     manifest = SimpleNamespace(clips=clips, **(whole | facts))
     return request.collect_data_warnings(
         {"data": {"name": name, "split": part or {}}}, SimpleNamespace(manifest=manifest)
@@ -24,7 +24,7 @@ def warnings(clips: list[SimpleNamespace], name: str = "mine", part: dict | None
 
 
 def test_remarks_count_the_clips_and_name_the_first():
-    bad = Skipped("b.npz", "NaN in frame 3")
+    bad = SkippedFile("b.npz", "NaN in frame 3")
     assert request.describe_skipped_files([]) is request.describe_unusual_clips({}) is None
     for word in ("2 files", "b.npz (NaN in frame 3)", "data.strict"):
         assert word in str(request.describe_skipped_files([bad, replace(bad, file="c.npz")]))
@@ -79,7 +79,7 @@ def test_a_part_of_the_data_is_told():
         (False, 0.5, "s1, 7 of 8, 50 % of its training groups"),
     ):
         part = {} if fraction is None else {"train_fraction": fraction}
-        found = warnings([], "s1", part, coverage=Coverage(whole=whole), interpolation="lines")
+        found = warnings([], "s1", part, coverage=Coverage(is_complete=whole), interpolation="lines")
         assert found["partial"] == words
 
 

@@ -23,9 +23,9 @@ def test_the_call_is_about_the_drawn_window(shift, make):
         rollout.begin(model)
     call = rollout.draw(model, SPLIT, sampler(), step=0)
     clips, end = sampler().draw(0)
-    assert torch.equal(call.true_frames, SPLIT.stretches(clips, end, model.frames))
+    assert torch.equal(call.true_frames, SPLIT.read_stretches(clips, end, model.frames))
     assert torch.equal(call.sparse, call.true_frames[:, -model.stride :, :SPARSE_DIM])
-    before = SPLIT.stretches(clips, end - model.stride, model.memory.past_frames)[..., :SPARSE_DIM]
+    before = SPLIT.read_stretches(clips, end - model.stride, model.memory.past_frames)[..., :SPARSE_DIM]
     assert torch.equal(call.state["sparse"], before)
     assert model.training or not isinstance(rollout, OwnPredictions)
 
@@ -35,7 +35,7 @@ def test_teacher_forcing_has_the_truth_and_zero_passes_have_nothing(shift):
     model = tiny.model(shift=shift)
     call = TeacherForcing().draw(model, SPLIT, sampler(), 0)
     clips, end = sampler().draw(0)
-    truth = SPLIT.stretches(clips, end - model.stride, model.memory.past_frames)
+    truth = SPLIT.read_stretches(clips, end - model.stride, model.memory.past_frames)
     torch.testing.assert_close(call.state["motion"], model.normalizer.encode(truth)[..., SPARSE_DIM:])
     empty = OwnPredictions(0).draw(model, SPLIT, sampler(), 0)
     assert float(empty.state["motion"].abs().sum()) == 0
@@ -49,9 +49,11 @@ def test_own_predictions_are_what_the_network_says():
     torch.manual_seed(next(s for s in range(99) if passes(s) == 2))
     call = OwnPredictions(2).draw(model, SPLIT, sampler(), 3)
     model.eval()
-    state = model.running_state(SPLIT.stretches(clips, end - 3, model.memory.past_frames)[..., :SPARSE_DIM])
+    state = model.running_state(
+        SPLIT.read_stretches(clips, end - 3, model.memory.past_frames)[..., :SPARSE_DIM]
+    )
     for back in (2, 1):
-        _, state = model.advance(SPLIT.stretches(clips, end - back, 1)[..., :SPARSE_DIM], state)
+        _, state = model.advance(SPLIT.read_stretches(clips, end - back, 1)[..., :SPARSE_DIM], state)
     torch.testing.assert_close(call.state, state)
 
 

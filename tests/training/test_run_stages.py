@@ -147,7 +147,7 @@ def test_a_nan_is_not_exported(home, memmlp, monkeypatch):
         "memmlp.deploy.parity.measure_differences", lambda *_: torch.tensor([1e-6, float("nan")])
     )
     monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run, opset: path.write_bytes(b""))
-    monkeypatch.setattr(MotionDataset, "clips", lambda self: [torch.zeros(2, 252)])
+    monkeypatch.setattr(MotionDataset, "read_clips", lambda self: [torch.zeros(2, 252)])
     ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--opset", "17")
     assert (ran.code, "not written" in ran.err) == (1, True)
     assert not list(home.glob("*never*")) + list(home.glob(".export-*"))

@@ -28,7 +28,7 @@ def test_pieces_are_of_the_training_clips_and_the_network_streams_through_each()
     one, dataset = task(), tiny.frames()
     assert one.frames.shape == (6, 20, 252)
     for piece, clip, motion in zip(one.frames, one.clips, one.streamed, strict=True):
-        known = dataset.clip(int(clip)).unfold(0, 20, 1).transpose(1, 2)
+        known = dataset.read_clip(int(clip)).unfold(0, 20, 1).transpose(1, 2)
         assert (known == piece).flatten(1).all(1).any()
         torch.testing.assert_close(
             motion, modes.predict_stream(one.model.network, [piece])[0], atol=1e-5, rtol=0

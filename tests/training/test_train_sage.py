@@ -50,7 +50,7 @@ def test_a_vqvae_sees_and_is_scored_on_its_half_alone(half):
 @torch.no_grad()
 def test_a_true_pose_has_no_error_and_hands_are_where_the_trackers_are():
     net = tiny.baseline("sage")
-    net.normalizer = Normalizer.raw(World(), tiny.REST)
+    net.normalizer = Normalizer.from_coordinates(World(), tiny.REST)
     true = FRAMES[:, -1, SPARSE_DIM:][..., ROTATION].unflatten(-1, (N_JOINTS, 6))
     errors = train_sage.measure_half_errors(net, UPPER, true[:, list(UPPER)], FRAMES[:, -1], true)
     assert {name: round(float(value), 6) for name, value in errors.items()} == dict.fromkeys(errors, 0.0)

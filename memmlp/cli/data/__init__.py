@@ -84,7 +84,7 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
 
     from memmlp.config.build_request import build_motion
     from memmlp.config.compose import compose_config
-    from memmlp.motion.preparing.cache import prepare as prepare_cache
+    from memmlp.motion.preparing.cache import prepare_cache
 
     has_protocol = any(override.startswith("data=") for override in overrides)
     cfg = compose_config([*([] if has_protocol else ["data=mocap"]), *overrides, "data.root=."])
@@ -100,12 +100,12 @@ def inspect(path: Path) -> None:
     PATH is a cache or a folder of npz files. For a cache, the command also shows the split.
     """
     from memmlp.motion.preparing.manifest import MANIFEST, Manifest, Total
-    from memmlp.motion.preparing.survey import survey
+    from memmlp.motion.preparing.survey import survey_folder
 
     if (path / MANIFEST).is_file():
         show_manifest(Manifest.load(path))
         return
-    content = survey(path)
+    content = survey_folder(path)
     show_skipped(content.skipped)
     show_pairs("unusual", content.unusual, ": ")
     show_pairs("some or all frames are the same", content.duplicates)

@@ -117,12 +117,12 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_a
     (trunk, neck, arms, legs, feet). Impossible postures and lengths are faults. The command continues after
     bad files. It exits with 1 if a file has a fault or cannot be imported.
     """
-    from memmlp.motion.clip import Skipped
+    from memmlp.motion.clip import SkippedFile
     from memmlp.motion.importing.import_folder import ImportSettings, verify_folder
 
     sound, bad, errors = 0, [], [(0.0, 0.0)]
     for row in verify_folder(source, ImportSettings(skeleton, body=body, up=up)):
-        if isinstance(row, Skipped):
+        if isinstance(row, SkippedFile):
             bad.append(f"{row.file}: {row.reason}")
             continue
         errors.append((row.mm.value, row.degrees.value))
@@ -154,18 +154,17 @@ def guess(file: Path, out: Path | None) -> None:
     The command prints the map, in which comments mark guesses and missing joints. Then it imports the file
     with the map and prints faults. It exits with 1 if the import fails.
     """
-    from memmlp.motion.importing.guess import as_yaml, check, write_map
-    from memmlp.motion.importing.guess import guess as guess_map
+    from memmlp.motion.importing.guess import convert_with_guess, format_yaml, guess_map, write_map
     from memmlp.motion.importing.recordings import read_recording
 
     recording = read_recording(file)
     proposed = guess_map(recording, file.stem)
-    text = as_yaml(proposed, recording)
+    text = format_yaml(proposed, recording)
     click.echo(text, nl=False)
     if out is not None:
         write_map(out, text)
     try:
-        converted = check(recording, proposed)
+        converted = convert_with_guess(recording, proposed)
     except InputError as error:
         raise click.ClickException(f"the file cannot be imported with this map: {error}") from None
     for fault in converted.fidelity.faults:

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from memmlp.common.errors import escape_line_breaks
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import INTERPOLATED, Skipped
-from memmlp.motion.preparing.find_clips import source_of
-from memmlp.motion.preparing.groups import divided_remark, unmatched_patterns_remark
+from memmlp.motion.clip import INTERPOLATED, SkippedFile
+from memmlp.motion.preparing.find_clips import get_source_name
+from memmlp.motion.preparing.groups import describe_divided_folders, describe_unmatched_patterns
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,7 +35,7 @@ def show_manifest(manifest: Manifest) -> None:
         table.add_row(part, str(total.clips), str(total.frames), f"{total.hours:.3f}")
     Console(highlight=False).print(table)
     for source in manifest.sources:
-        clips = tuple(clip for clip in manifest.clips if source_of(clip.name) == source)
+        clips = tuple(clip for clip in manifest.clips if get_source_name(clip.name) == source)
         totals = replace(manifest, clips=clips).totals.items()
         parts = [f"{part} {total.clips} clips, {total.hours:.3f} h" for part, total in totals]
         click.echo(f"{source}: {'; '.join(parts)}")
@@ -51,11 +51,11 @@ def show_manifest(manifest: Manifest) -> None:
         f"listed but missing {len(manifest.missing)}; body {manifest.body}"
     )
     names = [clip.name for clip in manifest.clips]
-    for remark in (divided_remark(manifest), unmatched_patterns_remark(manifest.split, names)):
+    for remark in (describe_divided_folders(manifest), describe_unmatched_patterns(manifest.split, names)):
         if remark:
             click.echo(remark)
-    if not manifest.coverage.whole:
-        click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")
+    if not manifest.coverage.is_complete:
+        click.echo(f"{manifest.coverage}: {manifest.coverage.gap_description}")
 
 
 def show_persons(manifest: Manifest) -> None:
@@ -85,7 +85,7 @@ def show_pairs(label: str, pairs: Mapping[str, str], sign: str = " = ") -> None:
     )
 
 
-def show_skipped(skipped: Sequence[Skipped]) -> None:
+def show_skipped(skipped: Sequence[SkippedFile]) -> None:
     """Print the first few skipped files and the number of the others."""
     show_some([f"skipped {file.file}: {file.reason}" for file in skipped], "skipped")
 

@@ -217,7 +217,7 @@ def read_npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     from memmlp.motion.body import check_imported_body
     from memmlp.motion.clip import resample
     from memmlp.motion.formats.npz import read_clip
-    from memmlp.motion.geometry import motion_frames
+    from memmlp.motion.geometry import compute_motion_frames
     from memmlp.motion.plausibility import check_plausible
 
     recorded = read_clip(path, path.stem)
@@ -228,7 +228,7 @@ def read_npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     if len(clip) < 3:
         raise InputError(f"{path}: has {len(clip)} frames at 60 Hz; must have 3 or more")
     tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, rest))
-    return motion_frames(*tensors).numpy()
+    return compute_motion_frames(*tensors).numpy()
 
 
 class ClipSource:

@@ -1,9 +1,9 @@
-"""Reads ASF/AMC, the format of the CMU and HDM05 databases: an AMC has the motion, an ASF the skeleton.
+"""Reads ASF/AMC, the format of the CMU and HDM05 databases. AMC files have motion; ASF files have skeletons.
 
-A bone turns about its own axes: its local rotation is C M C^-1, where C is the bone's `axis` and M the
-product of the frame's angles (order X Y Z means Rz Ry Rx, on column vectors, degrees). A node stands at the
-start of each bone and has the bone's rotation; a bone without children also has an end site. Lengths are
-converted to metres: the file's numbers are inches times the factor `length` of its `:units`. Y is up.
+A bone turns about its own axes. Its local rotation is C M C^-1: C is the bone's `axis`, and M is the product
+of the frame's angles (degrees; the order X Y Z means Rz Ry Rx on column vectors). Each bone has a node at its
+start with the bone's rotation. A bone without children also has an end site. Lengths are converted to metres.
+In the file they are inches times the factor `length` of `:units`. Y is up.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.formats.recording import END, Recording
 
 INCH = 0.0254  # metres
-LIMIT = 1e6  # the largest size of any number in the files
+LIMIT = 1e6  # maximum absolute value of all numbers in the files
 MAX_BYTES = 2**28
 ROOT = "root"
 ROTATIONS, POSITIONS = ("rx", "ry", "rz"), ("tx", "ty", "tz")
@@ -32,9 +32,10 @@ class Bone:
     """A bone of an ASF file.
 
     Attributes:
-        vector: from its start to its end in the zero pose (3,), metres.
-        axes: the rotation C of its own axes.
-        dofs: its values in a frame, of `rx`, `ry`, `rz` (and `tx`, `ty`, `tz` for the root), in their order.
+        vector: vector from the bone's start to its end in the zero pose (3,), metres.
+        axes: the rotation C of the bone's axes.
+        dofs: the bone's values in a frame, in the file's order: some of `rx`, `ry`, `rz`, and for the root
+            also `tx`, `ty`, `tz`.
     """
 
     vector: np.ndarray
@@ -44,22 +45,22 @@ class Bone:
 
 @dataclass(frozen=True)
 class AsfAmc(Recording):
-    """A take of an ASF/AMC database, in metres. Its nodes are the root, the bones, and then the end sites.
+    """A take in ASF/AMC format, in metres. Its nodes are the root, the bones, and the end sites.
 
     Attributes:
-        bones: the root and the bones, in the nodes' order; end sites are not included.
-        unit: metres in one of the file's length units.
-        first_frame: the number of the first frame, above 1 in takes that were cut.
+        bones: the root and the bones, in the order of the nodes, without end sites.
+        unit: the file's length unit, metres.
+        first_frame: number of the first frame, which is above 1 in cut takes.
     """
 
     bones: tuple[Bone, ...]
     unit: float
     first_frame: int
 
-    def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return global rotations (N, nodes, 3, 3) and positions (N, nodes, 3), metres, of all frames.
+    def compute_kinematics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3), metres, of all frames.
 
-        An end site has its bone's rotation.
+        An end site has the rotation of its bone.
         """
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.zeros((len(self.nodes), len(self), 3))
@@ -84,18 +85,18 @@ class AsfAmc(Recording):
             rotations[node] = above @ local
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
-    def pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose (`Recording.pose`)."""
+    def compute_pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
+        """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose (see `Recording`)."""
         values: list[float] = []
         for name, bone in zip(self.nodes, self.bones, strict=False):
             count = sum(dof in ROTATIONS for dof in bone.dofs)
-            given = list(turns.get(name, [0.0] * count))
-            if len(given) != count:
+            angles = list(turns.get(name, [0.0] * count))
+            if len(angles) != count:
                 raise InputError(
-                    f"{self.path}: rest.{name} has {len(given)} values; must have {count}, one for each angle"
+                    f"{self.path}: rest.{name} has {len(angles)} values; must have {count}, one per angle"
                 )
-            values += [given.pop(0) if dof in ROTATIONS else 0.0 for dof in bone.dofs]
-        rotations, positions = replace(self, values=np.array([values])).kinematics()
+            values += [angles.pop(0) if dof in ROTATIONS else 0.0 for dof in bone.dofs]
+        rotations, positions = replace(self, values=np.array([values])).compute_kinematics()
         return rotations[0], positions[0]
 
 
@@ -103,12 +104,11 @@ class AsfAmc(Recording):
 
 
 def read_amc(path: Path) -> AsfAmc:
-    """Read a take with its skeleton, which is in the same folder: `05.asf` for `05_01.amc`.
+    """Read a take and its skeleton, which is in the same folder (`05.asf` for `05_01.amc`).
 
     Raises:
-        InputError: for a missing skeleton, or anything damaged in one of the two files (sections, bones,
-            numbers, a frame without some bone, a gap between frames); the message names the file and where
-            possible the line.
+        InputError: if the skeleton is missing or one of the files is damaged, such as by invalid numbers,
+            missing bones, or a gap between frames. The message has the file and if possible the line.
     """
     names, parents, bones, unit = _read_asf(find_asf(path))
     ends = [node for node in range(len(names)) if node not in parents]
@@ -129,16 +129,18 @@ def read_amc(path: Path) -> AsfAmc:
 
 
 def find_asf(path: Path) -> Path:
-    """Return the skeleton of a take: of the folder's ASF files, the one with whose name the take's begins.
+    """Find the skeleton of a take: an ASF file in the same folder, such as `05.asf` for `05_01.amc`.
 
     Raises:
-        InputError: if there is none.
+        InputError: if there is no skeleton.
     """
     files = [file for file in path.parent.glob("*") if file.suffix.lower() == ".asf"]
-    own = [file for file in files if path.stem.lower().startswith(f"{file.stem}_".lower())]
-    if not own:
-        raise InputError(f"{path}: no skeleton beside it; expected {path.stem.partition('_')[0]}.asf")
-    return max(own, key=lambda file: len(file.stem))
+    matches = [file for file in files if path.stem.lower().startswith(f"{file.stem}_".lower())]
+    if not matches:
+        raise InputError(
+            f"{path}: no skeleton in the same folder; expected {path.stem.partition('_')[0]}.asf"
+        )
+    return max(matches, key=lambda file: len(file.stem))
 
 
 def _fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
@@ -146,11 +148,11 @@ def _fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
 
 
 def _read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the numbers and words of a file's lines, without comments and blank lines."""
+    """Yield line number and words of each line, without comments and blank lines."""
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: too large; expected at most {MAX_BYTES >> 20} MiB")
-        with open(path, encoding="latin-1") as file:  # comments have names in any encoding
+            raise InputError(f"{path}: too large; must be at most {MAX_BYTES >> 20} MiB")
+        with open(path, encoding="latin-1") as file:  # comments may have any encoding
             for number, line in enumerate(file, start=1):
                 if words := line.partition("#")[0].split():
                     yield number, words
@@ -166,7 +168,12 @@ def _parse_numbers(path: Path, line: int, words: Sequence[str], count: int, key:
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(abs(number) <= LIMIT for number in numbers):
-        _fail(path, line, f"{key} {' '.join(words)[:60]}", f"{count} numbers up to {LIMIT:g} in size")
+        _fail(
+            path,
+            line,
+            f"{key} {' '.join(words)[:60]}",
+            f"{count} numbers of at most {LIMIT:g} in absolute value",
+        )
     return numbers
 
 
@@ -174,7 +181,7 @@ def _parse_numbers(path: Path, line: int, words: Sequence[str], count: int, key:
 
 
 def _read_asf(path: Path) -> tuple[list[str], list[int], list[Bone], float]:
-    """Return the nodes' names and parents, the bones, and metres in a length unit of the file."""
+    """Read node names, their parents' indices, the bones, and the length unit in metres."""
     sections: dict[str, list[tuple[int, list[str]]]] = {}
     for line, words in _read_lines(path):
         if words[0].startswith(":"):
@@ -184,7 +191,7 @@ def _read_asf(path: Path) -> tuple[list[str], list[int], list[Bone], float]:
         else:
             rows.append((line, words))
     if missing := [key for key in (":units", ":root", ":bonedata", ":hierarchy") if not sections.get(key)]:
-        raise InputError(f"{path}: no {missing[0]}; expected :units, :root, :bonedata and :hierarchy")
+        raise InputError(f"{path}: has no {missing[0]}; expected :units, :root, :bonedata and :hierarchy")
     unit = _read_unit(path, sections[":units"])
     bones = {ROOT: _read_root(path, sections[":root"]), **_read_bones(path, sections[":bonedata"], unit)}
     names, parents = _read_hierarchy(path, sections[":hierarchy"], bones)
@@ -222,17 +229,17 @@ def _read_bones(path: Path, rows: Sequence[tuple[int, list[str]]], unit: float) 
     for line, words in rows:
         key = words[0].lower()
         if (key == "begin") == inside:
-            _fail(path, line, words[0][:40], "begin, the lines of one bone, then end")
+            _fail(path, line, words[0][:40], "begin, then the lines of one bone, then end")
         inside = key != "end"
         if key not in ("begin", "end"):
             values[key] = line, words[1:]
         elif key == "end":
             name, bone = _read_bone(path, line, values, unit)
             if name in bones or name == ROOT:
-                _fail(path, line, f"a second bone {name}", "a name for each bone")
+                _fail(path, line, f"a second bone {name}", "a unique name for each bone")
             bones[name], values = bone, {}
     if inside:
-        raise InputError(f"{path}: the last bone of :bonedata has no end")
+        raise InputError(f"{path}: the last bone of :bonedata has no end; expected an end line")
     return bones
 
 
@@ -240,7 +247,7 @@ def _read_bone(
     path: Path, end: int, values: Mapping[str, tuple[int, list[str]]], unit: float
 ) -> tuple[str, Bone]:
     if missing := [key for key in ("name", "direction", "length", "axis") if key not in values]:
-        _fail(path, end, f"no {missing[0]} in the bone that ends here", "name, direction, length and axis")
+        _fail(path, end, f"a bone without {missing[0]} ends here", "name, direction, length and axis")
     line, words = values["name"]
     if len(words) != 1:
         _fail(path, line, f"name {' '.join(words)[:40]}", "one word")
@@ -254,34 +261,39 @@ def _read_bone(
 def _parse_axes(path: Path, line: int, words: Sequence[str]) -> Rotation:
     order = words[-1].lower() if words else ""
     if sorted(order) != ["x", "y", "z"]:
-        _fail(path, line, f"axis {' '.join(words)[:60]}", "an order of axes such as XYZ at its end")
+        _fail(path, line, f"axis {' '.join(words)[:60]}", "an order of axes at the end, such as XYZ")
     return Rotation.from_euler(order, _parse_numbers(path, line, words[:-1], 3, "axis"), degrees=True)
 
 
-def _parse_dofs(path: Path, line: int, words: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+def _parse_dofs(path: Path, line: int, words: Sequence[str], choices: Sequence[str]) -> tuple[str, ...]:
     dofs = tuple(word.lower() for word in words)
-    if not dofs or not set(dofs) <= set(known) or len(set(dofs)) < len(dofs):
-        _fail(path, line, " ".join(words)[:60] or "no values", f"different ones of {' '.join(known)}")
+    if not dofs or not set(dofs) <= set(choices) or len(set(dofs)) < len(dofs):
+        _fail(
+            path,
+            line,
+            " ".join(words)[:60] or "no values",
+            f"one or more of {' '.join(choices)} without repetition",
+        )
     return dofs
 
 
 def _read_hierarchy(
     path: Path, rows: Sequence[tuple[int, list[str]]], bones: Mapping[str, Bone]
 ) -> tuple[list[str], list[int]]:
-    """Return the nodes' names, each after its parent's, and the parents' indices."""
+    """Read node names and their parents' indices. Each node comes after its parent."""
     names, parents = [ROOT], [-1]
     for line, (parent, *children) in rows:
         if parent.lower() in ("begin", "end") and not children:
             continue
         if parent not in names:
-            _fail(path, line, parent[:40], "a bone that is a child in a line above, or root")
+            _fail(path, line, parent[:40], "root, or a bone that is a child in an earlier line")
         for child in children:
             if child not in bones or child in names:
-                _fail(path, line, child[:40], "a bone of :bonedata that has no parent yet")
+                _fail(path, line, child[:40], "a bone of :bonedata without a parent in an earlier line")
             names.append(child)
             parents.append(names.index(parent))
     if left := sorted(set(bones) - set(names)):
-        raise InputError(f"{path}: {left[0]} is not in :hierarchy; expected every bone of :bonedata")
+        raise InputError(f"{path}: {left[0]} is missing in :hierarchy; expected every bone of :bonedata")
     return names, parents
 
 
@@ -289,7 +301,7 @@ def _read_hierarchy(
 
 
 def _read_frames(path: Path, widths: Mapping[str, int]) -> tuple[int, np.ndarray]:
-    """Return the first frame's number, and the values (N, C) of the bones in the order of `widths`."""
+    """Read the number of the first frame, and the values (N, C) in the order of `widths`."""
     values, frame = array("d"), dict[str, list[float]]()
     first = last = line = 0
 
@@ -311,11 +323,11 @@ def _read_frames(path: Path, widths: Mapping[str, int]) -> tuple[int, np.ndarray
             if last or word.upper() == ":RADIANS":
                 _fail(path, line, word[:40], "frames in degrees, after all keywords")
         elif not last or word not in widths or word in frame:
-            expected = "a bone of the skeleton that turns, once in a frame" if last else "a frame's number"
+            expected = "a bone with angles, at most once per frame" if last else "a frame number"
             _fail(path, line, word[:40], expected)
         else:
             frame[word] = _parse_numbers(path, line, numbers, widths[word], word)
     if not last:
-        raise InputError(f"{path}: no frames; expected a frame's number, then a line for each bone")
+        raise InputError(f"{path}: has no frames; expected a frame number, then one line per bone")
     finish()
     return first, np.array(values).reshape(-1, sum(widths.values()))

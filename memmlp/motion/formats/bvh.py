@@ -1,9 +1,9 @@
-"""Reads and writes BVH files, and computes their joints' global rotations and positions.
+"""Reads and writes BVH files, and computes the joints' global rotations and positions.
 
-A joint's rotation is the product of its rotation channels in the file's order (Z X Y means Rz Rx Ry, on
-column vectors, degrees in the file); its position channels, if it has any, replace the numbers of its OFFSET.
+A joint's rotation is the product of its rotation channels in the file's order (degrees; Z X Y means Rz Rx Ry
+on column vectors). Position channels replace the numbers in OFFSET.
 
-Written files have 22 joints and their end sites, centimetres, Y up, and the body's T-pose as zero pose.
+Written files have 22 joints with end sites, centimetres, Y up, and the body's T-pose as zero pose.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_file
 from memmlp.motion.body import JOINTS, PARENTS
-from memmlp.motion.clip import FRAME_RATE_RANGE, USUAL_RATES, Clip, y_up_motion
+from memmlp.motion.clip import FRAME_RATE_RANGE, USUAL_RATES, Clip, convert_to_y_up
 from memmlp.motion.formats.recording import END, Recording
 
 AXES = "XYZ"
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
-LIMIT = 1e6  # the largest size of any number in the file, in its units or degrees
+LIMIT = 1e6  # maximum absolute value of all numbers in the file
 MAX_JOINTS = 1000
-MAX_BYTES = 2**28  # about half an hour of 93 channels at 120 Hz
-RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits
-COARSEST = 0.05  # relative: a frame time that is rounded more coarsely does not identify a usual rate
+MAX_BYTES = 2**28  # about half an hour with 93 channels at 120 Hz
+RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, because the header has few digits
+COARSEST = 0.05  # relative: a more coarsely rounded frame time does not identify a usual rate
 
-CENTIMETRES = 100.0  # in a metre
+CENTIMETRES = 100.0  # per metre
 NUMBER = "%.6f"  # 1e-8 m and 1e-6 degrees: more precise than a clip's float32
 TIPS = {
     "left_foot": (0.0, 0.0, 0.06), "right_foot": (0.0, 0.0, 0.06), "head": (0.0, 0.18, 0.0),
     "left_wrist": (0.17, 0.0, 0.0), "right_wrist": (-0.17, 0.0, 0.0),
 }  # fmt: skip
-"""From the last joints to the tips of toes, head and fingers, metres, body frame: bones are drawn to them."""
+"""Vectors from the last joints to the tips of toes, head and fingers, metres, body frame."""
 
 
 @dataclass(frozen=True)
 class Bvh(Recording):
-    """A BVH file. Its nodes are its joints and then its end sites.
+    """A BVH file. Its nodes are the joints, followed by the end sites.
 
     Attributes:
-        channels: each joint's channels in the file's order, of `CHANNELS`; end sites are not included.
+        channels: each joint's channels (see `CHANNELS`) in the file's order, without end sites.
     """
 
     channels: tuple[tuple[str, ...], ...]
 
-    def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return global rotations (N, nodes, 3, 3) and positions (N, nodes, 3) of all frames.
+    def compute_kinematics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3) of all frames.
 
-        An end site has its joint's rotation.
+        An end site has the rotation of its joint.
         """
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.empty((len(self.nodes), len(self), 3))
@@ -72,33 +72,33 @@ class Bvh(Recording):
             rotations[joint] = above
             for name, angles in zip(channels, np.radians(values).T, strict=True):
                 if name.endswith("rotation"):
-                    _turn(rotations[joint], AXES.index(name[0]), angles)
+                    _rotate(rotations[joint], AXES.index(name[0]), angles)
         for node in range(len(self.channels), len(self.nodes)):
             parent = self.node_parents[node]
             rotations[node] = rotations[parent]
             positions[node] = positions[parent] + rotations[parent] @ self.offsets[node]
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
-    def pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose (`Recording.pose`)."""
+    def compute_pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
+        """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose (see `Recording`)."""
         values: list[float] = []
         for joint, channels in enumerate(self.channels):
             count = sum(channel.endswith("rotation") for channel in channels)
-            given = list(turns.get(self.nodes[joint], [0.0] * count))
-            if len(given) != count:
+            angles = list(turns.get(self.nodes[joint], [0.0] * count))
+            if len(angles) != count:
                 raise InputError(
-                    f"{self.path}: rest.{self.nodes[joint]} has {len(given)} values; "
-                    f"must have {count}, one for each rotation channel"
+                    f"{self.path}: rest.{self.nodes[joint]} has {len(angles)} values; "
+                    f"must have {count}, one per rotation channel"
                 )
             for channel in channels:
                 shift = 0.0 if joint == 0 else self.offsets[joint][AXES.index(channel[0])]
-                values.append(given.pop(0) if channel.endswith("rotation") else shift)
-        rotations, positions = replace(self, values=np.array([values])).kinematics()
+                values.append(angles.pop(0) if channel.endswith("rotation") else shift)
+        rotations, positions = replace(self, values=np.array([values])).compute_kinematics()
         return rotations[0], positions[0]
 
 
-def _turn(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
-    """Multiply rotations (N, 3, 3), in place and on the right, by turns of (N,) radians about an axis."""
+def _rotate(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
+    """Multiply rotations (N, 3, 3) on the right by rotations about an axis (N,), radians, in place."""
     second, third = (axis + 1) % 3, (axis + 2) % 3
     sine, cosine = np.sin(angles)[:, None], np.cos(angles)[:, None]
     a, b = rotations[:, :, second].copy(), rotations[:, :, third].copy()
@@ -110,24 +110,26 @@ def _turn(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
 
 
 def read_bvh(path: Path) -> Bvh:
-    """Read a BVH file; line ends, blanks and letter case of keywords may vary, nothing else.
+    """Read a BVH file. Line ends, blanks and the letter case of keywords may vary.
 
     Raises:
-        InputError: for anything damaged (braces, numbers, counts, names, channels, an impossible frame time,
-            more than 1000 joints, bytes that are not UTF-8) and for files of more than 256 MiB; the message
-            names the file and where possible the line.
+        InputError: if the file is damaged (braces, numbers, counts, names, channels, frame time, encoding),
+            has more than 1000 joints, or is larger than 256 MiB. The message has the file and if possible the
+            line.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: too large; expected at most {MAX_BYTES >> 20} MiB")
+            raise InputError(f"{path}: too large; must be at most {MAX_BYTES >> 20} MiB")
         with open(path, encoding="utf-8-sig") as file:
             lines = enumerate(file, start=1)
-            names, parents, offsets, channels = _read_hierarchy(_Words(path, lines))
+            names, parents, offsets, channels = _read_hierarchy(_WordReader(path, lines))
             fps, values = _read_motion(path, lines, sum(map(len, channels)))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a BVH file") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.object[error.start]:#04x}; expected UTF-8 text") from error
+        raise InputError(
+            f"{path}: invalid byte {error.object[error.start]:#04x}; expected UTF-8 text"
+        ) from error
     return Bvh(path, tuple(names), tuple(parents), np.array(offsets), fps, values, tuple(channels))
 
 
@@ -135,8 +137,8 @@ def _fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
     raise InputError(f"{path}: line {line}: {wrong}; expected {expected}")
 
 
-class _Words:
-    """The words of the hierarchy, one after the other; `line` is the line of the last one."""
+class _WordReader:
+    """Reads the hierarchy word by word. `line` is the line number of the last word."""
 
     def __init__(self, path: Path, lines: Iterator[tuple[int, str]]) -> None:
         self.path, self.line = path, 1
@@ -147,108 +149,115 @@ class _Words:
             if line.strip().upper() == "MOTION":
                 return
             yield from line.replace("{", " { ").replace("}", " } ").split()
-        raise InputError(f"{self.path}: no MOTION line; expected HIERARCHY, then MOTION")
+        raise InputError(f"{self.path}: has no MOTION line; expected HIERARCHY, then MOTION")
 
     def fail(self, wrong: str, expected: str) -> NoReturn:
         _fail(self.path, self.line, wrong, expected)
 
-    def next(self, expected: str) -> str:
+    def read_word(self, expected: str) -> str:
         word = next(self._words, None)
         return word if word is not None else self.fail("the hierarchy ends too early", expected)
 
-    def keyword(self, *keywords: str) -> str:
-        """Return the next word in capitals, which must be one of the keywords."""
-        word = self.next(" or ".join(keywords))
+    def read_keyword(self, *keywords: str) -> str:
+        """Read one of the keywords, and return it in capitals."""
+        word = self.read_word(" or ".join(keywords))
         return word.upper() if word.upper() in keywords else self.fail(_quote(word), " or ".join(keywords))
 
-    def offset(self) -> list[float]:
-        self.keyword("OFFSET")
-        expected = f"three numbers up to {LIMIT:g} in size after OFFSET"
-        words = [self.next(expected) for _ in range(3)]
+    def read_offset(self) -> list[float]:
+        self.read_keyword("OFFSET")
+        expected = f"three numbers of at most {LIMIT:g} in absolute value after OFFSET"
+        words = [self.read_word(expected) for _ in range(3)]
         wrong = [word for word in words if not abs(_parse_number(word)) <= LIMIT]
         return list(map(_parse_number, words)) if not wrong else self.fail(_quote(wrong[0]), expected)
 
-    def channels(self) -> tuple[str, ...]:
-        self.keyword("CHANNELS")
-        expected = f"0 to {len(CHANNELS)} and as many different ones of {', '.join(CHANNELS)} after CHANNELS"
-        count = self.next(expected)
+    def read_channels(self) -> tuple[str, ...]:
+        self.read_keyword("CHANNELS")
+        expected = f"a count from 0 to {len(CHANNELS)} and that many of {', '.join(CHANNELS)} after CHANNELS"
+        count = self.read_word(expected)
         if count not in map(str, range(len(CHANNELS) + 1)):
             self.fail(_quote(count), expected)
-        names = tuple(self.next(expected).capitalize() for _ in range(int(count)))
+        names = tuple(self.read_word(expected).capitalize() for _ in range(int(count)))
         wrong = next((name for name in names if name not in CHANNELS or names.count(name) > 1), None)
         return names if wrong is None else self.fail(_quote(wrong), expected)
 
-    def end(self) -> None:
+    def expect_end(self) -> None:
         if (word := next(self._words, None)) is not None:
-            self.fail(_quote(word), "MOTION after the root's last }")
+            self.fail(_quote(word), "MOTION after the root's closing }")
 
 
-def _read_hierarchy(words: _Words) -> tuple[list[str], list[int], list[list[float]], list[tuple[str, ...]]]:
+def _read_hierarchy(
+    words: _WordReader,
+) -> tuple[list[str], list[int], list[list[float]], list[tuple[str, ...]]]:
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float]] = []
     channels: list[tuple[str, ...]] = []
     ends: dict[str, tuple[int, list[float]]] = {}
-    open_joints: list[int] = []  # without their closing }
+    open_joints: list[int] = []  # joints before their closing }
 
     def check(name: str) -> str:
         if name in ("{", "}") or name in names or name in ends:
-            words.fail(f"name {_quote(name)}", "a name for each joint, and no name (or end site) twice")
+            words.fail(
+                f"name {_quote(name)}", "a unique name for each joint, and at most one end site per joint"
+            )
         return name
 
-    words.keyword("HIERARCHY")
-    keyword = words.keyword("ROOT")
+    words.read_keyword("HIERARCHY")
+    keyword = words.read_keyword("ROOT")
     while keyword != "}" or len(open_joints) > 1:
         if keyword == "}":
             open_joints.pop()
         elif keyword == "END":
             name = check(names[open_joints[-1]] + END)
-            words.keyword("SITE")
-            words.keyword("{")
-            ends[name] = open_joints[-1], words.offset()
-            words.keyword("}")
+            words.read_keyword("SITE")
+            words.read_keyword("{")
+            ends[name] = open_joints[-1], words.read_offset()
+            words.read_keyword("}")
         else:
             if len(names) == MAX_JOINTS:
-                words.fail("one joint more", f"up to {MAX_JOINTS} joints")
-            names.append(check(words.next("a joint's name")))
+                words.fail("too many joints", f"at most {MAX_JOINTS} joints")
+            names.append(check(words.read_word("a joint's name")))
             parents.append(open_joints[-1] if open_joints else -1)
             open_joints.append(len(names) - 1)
-            words.keyword("{")
-            offsets.append(words.offset())
-            channels.append(words.channels())
-        keyword = words.keyword("JOINT", "END", "}")
-    words.end()
+            words.read_keyword("{")
+            offsets.append(words.read_offset())
+            channels.append(words.read_channels())
+        keyword = words.read_keyword("JOINT", "END", "}")
+    words.expect_end()
     parents += [joint for joint, _ in ends.values()]
     offsets += [offset for _, offset in ends.values()]
     return [*names, *ends], parents, offsets, channels
 
 
 def _read_motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[float, np.ndarray]:
-    """Read the frame rate and values (N, width) from the lines after MOTION, without blank ones."""
+    """Read frame rate and values (N, width) from the lines after MOTION. Blank lines are ignored."""
     rows = ((number, line.strip()) for number, line in lines if line.strip())
     first, second = next(rows, None), next(rows, None)
     if first is None or second is None or width == 0:
-        raise InputError(f"{path}: no motion; expected channels, Frames:, Frame Time: and the frames")
+        raise InputError(
+            f"{path}: has no motion; expected channels, Frames:, Frame Time: and the values of all frames"
+        )
     frames = _read_header(path, *first, "Frames:")
     if not re.fullmatch(r"0*[1-9]\d{0,8}", frames, re.ASCII):
-        _fail(path, first[0], f"Frames: {_quote(frames)}", "a whole number from 1")
+        _fail(path, first[0], f"Frames: {_quote(frames)}", "a whole number of at least 1")
     low, high = FRAME_RATE_RANGE
     frame_time = _read_header(path, *second, "Frame Time:")
     if not 1 / high <= _parse_number(frame_time) <= 1 / low:
         _fail(path, second[0], f"Frame Time: {_quote(frame_time)}", f"{1 / high:g} to {1 / low:g} s")
-    values = array("d")  # a list of rows would be much larger than its numbers
+    values = array("d")  # a list of rows would need much more memory
     for number, line in rows:
         values.extend(_read_frame(path, number, line.split(), width))
     if len(values) != int(frames) * width:
         wrong = f"Frames: {int(frames)}, but {len(values) // width} lines of values follow"
-        _fail(path, first[0], wrong, "one line for each frame")
-    return _find_rate(frame_time), np.array(values).reshape(-1, width)
+        _fail(path, first[0], wrong, "one line per frame")
+    return _parse_rate(frame_time), np.array(values).reshape(-1, width)
 
 
-def _find_rate(frame_time: str) -> float:
-    """Return a rate, rounded to a whole number or a usual rate where the frame time's digits allow it.
+def _parse_rate(frame_time: str) -> float:
+    """Convert a frame time to a rate, Hz.
 
-    The time may be rounded to its last digit, or cut off after it: 0.0167 and 0.0166 are 60 Hz.
+    If the rate is nearly a whole number, it is rounded. A frame time with few digits gives the matching usual
+    rate: both 0.0167 (rounded) and 0.0166 (cut off) are 60 Hz.
     """
     seconds = _parse_number(frame_time)
     if abs(1 / seconds - round(1 / seconds)) <= RATE_DIGITS / seconds:
@@ -262,7 +271,7 @@ def _find_rate(frame_time: str) -> float:
 
 
 def _read_header(path: Path, number: int, line: str, key: str) -> str:
-    """Return the value of `key: value`; letter case and blanks may vary."""
+    """Return the value in a line `key: value`. Letter case and blanks may vary."""
     pattern = key.replace(" ", r"\s*").replace(":", r"\s*:\s*(\S+)")
     match = re.fullmatch(pattern, line, re.IGNORECASE)
     return match[1] if match else _fail(path, number, _quote(line), f"{key} and one number")
@@ -270,19 +279,19 @@ def _read_header(path: Path, number: int, line: str, key: str) -> str:
 
 def _read_frame(path: Path, number: int, words: list[str], width: int) -> list[float]:
     if len(words) != width:
-        _fail(path, number, f"{len(words)} values", f"{width}, one for each channel")
+        _fail(path, number, f"{len(words)} values", f"{width}, one per channel")
     try:
         values = list(map(float, words))
     except ValueError:
         values = [float("nan")]
     if not all(abs(value) <= LIMIT for value in values) or any("_" in word for word in words):
         wrong = next((word for word in words if not abs(_parse_number(word)) <= LIMIT), words[0])
-        _fail(path, number, _quote(wrong), f"numbers up to {LIMIT:g} in size")
+        _fail(path, number, _quote(wrong), f"numbers of at most {LIMIT:g} in absolute value")
     return values
 
 
 def _parse_number(word: str) -> float:
-    """Parse a number as BVH writes it; NaN for anything else, also for `1_0` or `Infinity`."""
+    """Parse a decimal number; invalid text, such as `1_0` or `Infinity`, gives NaN."""
     try:
         return float(word) if re.fullmatch(r"[-+.0-9eE]+", word) else float("nan")
     except ValueError:
@@ -297,68 +306,71 @@ def _quote(word: str) -> str:
 
 
 def write_bvh(path: Path, clip: Clip, rest: np.ndarray) -> None:
-    """Write a clip on a body with these rest joints (22, 3), metres, atomically.
+    """Write a clip on a body with rest joints `rest` (22, 3), metres, atomically.
 
-    `memmlp data import` knows the joints (`importing/skeletons/smpl_words.yaml`); `memmlp.yaml` there also
-    gives the axes, for clips without a standing person.
+    `memmlp data import` recognises the joints as skeleton `smpl_words`. The skeleton `memmlp` also has unit
+    and axes, for clips without a standing person.
     """
     with atomic_file(path) as file:
-        for line in ("HIERARCHY", *_joint_lines(0, rest, ""), *_motion_lines(clip, rest)):
+        for line in ("HIERARCHY", *_format_joint(0, rest, ""), *_format_motion(clip, rest)):
             file.write(f"{line}\n".encode())
 
 
-def _joint_lines(joint: int, rest: np.ndarray, indent: str) -> Iterator[str]:
+def _format_joint(joint: int, rest: np.ndarray, indent: str) -> Iterator[str]:
     """Yield the lines of a joint and of all joints below it.
 
-    The root's offset is zero, since some programs add it to the position channels and others do not.
+    The root's offset is zero, because only some programs add it to the position channels.
     """
     offset = rest[joint] - rest[max(PARENTS[joint], 0)]
     position = "" if joint else "Xposition Yposition Zposition "
     yield f"{indent}{'JOINT' if joint else 'ROOT'} {JOINTS[joint]}"
     yield f"{indent}{{"
-    yield f"{indent}\tOFFSET {_centimetres(offset)}"
+    yield f"{indent}\tOFFSET {_format_centimetres(offset)}"
     yield f"{indent}\tCHANNELS {3 if joint else 6} {position}Zrotation Xrotation Yrotation"
-    for child in _children(joint):
-        yield from _joint_lines(child, rest, indent + "\t")
+    for child in _list_children(joint):
+        yield from _format_joint(child, rest, indent + "\t")
     if JOINTS[joint] in TIPS:
-        tip = _centimetres(np.array(TIPS[JOINTS[joint]]))
+        tip = _format_centimetres(np.array(TIPS[JOINTS[joint]]))
         yield from (f"{indent}\t{line}" for line in ("End Site", "{", f"\tOFFSET {tip}", "}"))
     yield f"{indent}}}"
 
 
-def _children(joint: int) -> list[int]:
+def _list_children(joint: int) -> list[int]:
     return [child for child, parent in enumerate(PARENTS) if parent == joint]
 
 
-def _centimetres(metres: np.ndarray) -> str:
+def _format_centimetres(metres: np.ndarray) -> str:
     return " ".join(NUMBER % value for value in CENTIMETRES * metres)
 
 
-def _motion_lines(clip: Clip, rest: np.ndarray) -> Iterator[str]:
+def _format_motion(clip: Clip, rest: np.ndarray) -> Iterator[str]:
     yield from ("MOTION", f"Frames: {len(clip)}", f"Frame Time: {1 / clip.fps:.12f}")
 
     def below(joint: int) -> Iterator[int]:  # in the hierarchy's order
         yield joint
-        for child in _children(joint):
+        for child in _list_children(joint):
             yield from below(child)
 
     order, before = list(below(0)), None
-    for piece in clip.pieces():
-        rotations, root = y_up_motion(piece, rest)
-        angles = euler_zxy(rotations, before)
+    for piece in clip.split_into_pieces():
+        rotations, root = convert_to_y_up(piece, rest)
+        angles = compute_euler_zxy(rotations, before)
         before = angles[-1]
         values = np.concatenate([CENTIMETRES * root, angles[:, order].reshape(len(piece), -1)], 1)
         form = " ".join([NUMBER] * values.shape[1])
         yield from (form % tuple(row) for row in values.tolist())
 
 
-def euler_zxy(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+def compute_euler_zxy(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """Return angles (N, ..., 3), degrees, with Rz Rx Ry = rotations (N, ..., 3, 3).
 
-    Several triples of angles give the same rotation (two, and full turns). Each frame has the triple nearest
-    to the frame before, so that a program may interpolate between frames. In gimbal lock, where only the sum
-    of the outer angles counts, the product is still the rotation. The first frame's triple is near the angles
-    (..., 3) `before` it, if they are given.
+    A rotation has two triples of angles, apart from full turns. Each frame gets the triple that is nearest to
+    the previous frame, so that programs can interpolate between frames. The result is also valid in gimbal
+    lock.
+
+    Args:
+        rotations: rotation matrices.
+        before: angles (..., 3) of the frame before the first frame, degrees, if there is one.
     """
     z = np.arctan2(-rotations[..., 0, 1], rotations[..., 1, 1])
     cosine, sine = np.cos(z)[..., None], np.sin(z)[..., None]
@@ -368,20 +380,20 @@ def euler_zxy(rotations: np.ndarray, before: np.ndarray | None = None) -> np.nda
     y = np.arctan2(first[..., 2], first[..., 0])
     angles = np.stack([z, x, y], -1)
     if before is None:
-        return np.degrees(_continuous(angles))
-    return np.degrees(_continuous(np.concatenate([np.radians(before)[None], angles]))[1:])
+        return np.degrees(_make_continuous(angles))
+    return np.degrees(_make_continuous(np.concatenate([np.radians(before)[None], angles]))[1:])
 
 
-def _continuous(angles: np.ndarray) -> np.ndarray:
-    """Return the same rotations by angles Z X Y (N, ..., 3), radians, without jumps between frames."""
+def _make_continuous(angles: np.ndarray) -> np.ndarray:
+    """Return equivalent angles Z X Y (N, ..., 3), radians, without jumps between frames."""
 
     def without_turns(angles: np.ndarray) -> np.ndarray:
         return np.remainder(angles + np.pi, 2 * np.pi) - np.pi
 
-    others = np.array([np.pi, np.pi, np.pi]) + np.array([1, -1, 1]) * angles  # of the same rotations
+    others = np.array([np.pi, np.pi, np.pi]) + np.array([1, -1, 1]) * angles  # equivalent angles
     steps = without_turns(angles[1:] - angles[:-1])
     changed = without_turns(others[1:] - angles[:-1])
     changes = np.abs(changed).sum(-1) < np.abs(steps).sum(-1)
     second = np.zeros(angles.shape[:-1], bool)
-    second[1:] = np.cumsum(changes, axis=0) % 2  # a change from the second triple leads back to the first
+    second[1:] = np.cumsum(changes, axis=0) % 2  # the second change selects the first triple again
     return np.unwrap(np.where(second[..., None], others, angles), axis=0)

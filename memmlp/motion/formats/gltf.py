@@ -1,8 +1,8 @@
-"""Writes clips as glTF 2.0 (.glb), with a mannequin that is skinned to 22 nodes, and the mannequin as VRM.
+"""Writes clips as glTF 2.0 files (.glb) with a mannequin skinned to 22 nodes, and the mannequin as VRM.
 
-The world is glTF's: right-handed, Y up, metres, seconds. In the bind pose the person stands in T-pose on the
-floor and faces +Z; a node has its joint's name, its rotation is the joint's local rotation, and only the
-root is translated. JSON and buffers are written as in the specification (Khronos Group, glTF 2.0.1).
+The world has glTF's conventions: right-handed, Y up, metres, seconds. In the bind pose the person stands in
+T-pose on the floor and faces +Z. Each joint has a node with the joint's name and local rotation. Only the
+root is translated. The format is specified by the Khronos Group (glTF 2.0.1).
 """
 
 from __future__ import annotations
@@ -20,43 +20,42 @@ from scipy.spatial.transform import Rotation
 import memmlp
 from memmlp.common.files import atomic_file
 from memmlp.motion.body import HEAD, JOINTS, N_JOINTS, PARENTS
-from memmlp.motion.clip import Clip, y_up_motion
-from memmlp.motion.limb_shapes import LIMBS, ends
+from memmlp.motion.clip import Clip, convert_to_y_up
+from memmlp.motion.limb_shapes import LIMBS, find_limb_ends
 
-COMPONENTS = {"<f4": 5126, "<u2": 5123, "|u1": 5121}  # glTF's numbers for types of components
-VERTICES, INDICES = 34962, 34963  # kinds of buffer views
-COLOUR = (0.38, 0.44, 0.50, 1.0)  # of the mannequin, linear RGB and opacity
-AROUND, CAP = 16, 4  # vertices around a limb; rings of the half sphere at each of its ends
+COMPONENTS = {"<f4": 5126, "<u2": 5123, "|u1": 5121}  # glTF's codes for component types
+VERTICES, INDICES = 34962, 34963  # glTF's codes for buffer view targets
+COLOUR = (0.38, 0.44, 0.50, 1.0)  # colour of the mannequin: linear RGB and opacity
+AROUND, CAP = 16, 4  # number of vertices around a limb; number of rings per half sphere
 
 
 def write_gltf(path: Path, clip: Clip, rest: np.ndarray) -> None:
-    """Write a clip on a body with these rest joints (22, 3), metres, as a .glb file, atomically."""
+    """Write a clip as a .glb file, atomically, on a body with rest joints `rest` (22, 3), metres."""
     buffer = Buffer()
     bind = rest - [0, rest[:, 1].min(), 0]  # the lowest joint on the floor
     look = {"baseColorFactor": COLOUR, "metallicFactor": 0.0, "roughnessFactor": 0.7}
-    figure = skinned_figure(buffer, bind, [mannequin(bind)])
+    figure = build_skinned_figure(buffer, bind, [build_mannequin(bind)])
     materials = [{"name": "mannequin", "pbrMetallicRoughness": look}]
-    animations = [_animation(buffer, clip, rest)]
+    animations = [_build_animation(buffer, clip, rest)]
     write_glb(path, {**figure, "materials": materials, "animations": animations}, buffer)
 
 
 @dataclass
 class Buffer:
-    """The binary part of a file as it grows, and the JSON entries that describe it."""
+    """The growing binary part of a file, and the JSON entries that describe its content."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[dict[str, Any]] = field(default_factory=list)
     accessors: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, array: np.ndarray, kind: str, target: int | None = None, bounds: bool = False) -> int:
-        """Append elements (N, ...) of a kind such as "VEC3", and return their accessor's index.
+        """Append an array, and return the index of its accessor.
 
         Args:
-            array: the elements, of a component type that glTF knows.
-            kind: SCALAR, VEC3, VEC4 or MAT4.
+            array: the elements (N, ...), with a type in `COMPONENTS`.
+            kind: type of each element: SCALAR, VEC3, VEC4 or MAT4.
             target: VERTICES or INDICES, for a mesh.
-            bounds: whether the smallest and largest values are given, as glTF demands for times and
-                positions.
+            bounds: whether to add the minimum and maximum, which glTF requires for times and positions.
         """
         accessor: dict[str, Any] = {
             "bufferView": len(self.views), "componentType": COMPONENTS[array.dtype.str],
@@ -73,13 +72,13 @@ class Buffer:
 
 
 class Mesh(NamedTuple):
-    """Triangles with vertices that each follow one joint.
+    """A triangle mesh in which each vertex follows one joint.
 
     Attributes:
         positions: vertices (V, 3), metres, in the bind pose.
         normals: unit normals (V, 3).
         joints: the joint (V,) that each vertex follows.
-        triangles: vertices' indices (T, 3), counter-clockwise seen from outside.
+        triangles: indices of vertices (T, 3), counter-clockwise when seen from outside.
     """
 
     positions: np.ndarray
@@ -88,13 +87,13 @@ class Mesh(NamedTuple):
     triangles: np.ndarray
 
 
-def skinned_figure(buffer: Buffer, bind: np.ndarray, parts: Sequence[Mesh]) -> dict[str, Any]:
-    """Return the glTF content of meshes that follow the 22 joints, without materials.
+def build_skinned_figure(buffer: Buffer, bind: np.ndarray, parts: Sequence[Mesh]) -> dict[str, Any]:
+    """Build the glTF content for meshes that follow the 22 joints, without materials.
 
     Args:
-        buffer: gets the meshes.
-        bind: the joints in the bind pose (22, 3), metres.
-        parts: the meshes; each has the material of its index.
+        buffer: the buffer to which the meshes are added.
+        bind: joint positions in the bind pose (22, 3), metres.
+        parts: the meshes. Mesh i has material i.
     """
     nodes: list[dict[str, Any]] = []
     for joint, parent in enumerate(PARENTS):
@@ -106,7 +105,7 @@ def skinned_figure(buffer: Buffer, bind: np.ndarray, parts: Sequence[Mesh]) -> d
     inverse[:, 3, :3] = -bind  # glTF stores matrices by columns
     matrices = buffer.add(inverse, "MAT4")
     skin = {"joints": list(range(N_JOINTS)), "skeleton": 0, "inverseBindMatrices": matrices}
-    primitives = [_primitive(buffer, part, material) for material, part in enumerate(parts)]
+    primitives = [_build_primitive(buffer, part, material) for material, part in enumerate(parts)]
     return {
         "asset": {"version": "2.0", "generator": f"memmlp {memmlp.__version__}"},
         "scene": 0,
@@ -117,8 +116,8 @@ def skinned_figure(buffer: Buffer, bind: np.ndarray, parts: Sequence[Mesh]) -> d
     }
 
 
-def _primitive(buffer: Buffer, mesh: Mesh, material: int) -> dict[str, Any]:
-    """Return a mesh as a glTF primitive. It has four joints per vertex; three of them have no weight."""
+def _build_primitive(buffer: Buffer, mesh: Mesh, material: int) -> dict[str, Any]:
+    """Build a glTF primitive from a mesh. Of the four joints per vertex, only the first has weight."""
     joints = np.zeros((len(mesh.joints), 4), "|u1")
     weights = np.zeros((len(mesh.joints), 4), "<f4")
     joints[:, 0], weights[:, 0] = mesh.joints, 1
@@ -132,22 +131,22 @@ def _primitive(buffer: Buffer, mesh: Mesh, material: int) -> dict[str, Any]:
     return {"attributes": attributes, "indices": indices, "material": material}
 
 
-def _animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
+def _build_animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
     quaternions = np.empty((len(clip), N_JOINTS, 4), "<f4")
     root = np.empty((len(clip), 3), "<f4")
     end = 0
-    for piece in clip.pieces():
-        rotations, positions = y_up_motion(piece, rest)
+    for piece in clip.split_into_pieces():
+        rotations, positions = convert_to_y_up(piece, rest)
         before = quaternions[end - 1] if end else None
         here = slice(end, end := end + len(piece))
-        quaternions[here], root[here] = continuous_quaternions(rotations, before), positions
+        quaternions[here], root[here] = compute_continuous_quaternions(rotations, before), positions
     times = buffer.add((np.arange(len(clip)) / clip.fps).astype("<f4"), "SCALAR", bounds=True)
     outputs = [(0, "translation", buffer.add(root, "VEC3"))]
     for joint in range(N_JOINTS):
         outputs.append((joint, "rotation", buffer.add(np.ascontiguousarray(quaternions[:, joint]), "VEC4")))
     return {
         "name": clip.name.encode("utf-8", "replace").decode(),
-        "samplers": [{"input": times, "interpolation": "LINEAR", "output": made} for *_, made in outputs],
+        "samplers": [{"input": times, "interpolation": "LINEAR", "output": output} for *_, output in outputs],
         "channels": [
             {"sampler": index, "target": {"node": joint, "path": path}}
             for index, (joint, path, _) in enumerate(outputs)
@@ -155,11 +154,14 @@ def _animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
     }
 
 
-def continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
-    """Return unit quaternions xyzw (N, J, 4) of rotations (N, J, 3, 3).
+def compute_continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+    """Convert rotations (N, J, 3, 3) to unit quaternions xyzw (N, J, 4).
 
-    Two quaternions stand for each rotation; each frame has the one nearer to the frame before. The first
-    frame's are near the quaternions (J, 4) `before` it, if they are given.
+    A rotation has two quaternions. Each frame gets the quaternion nearer to the previous frame.
+
+    Args:
+        rotations: rotation matrices.
+        before: quaternions (J, 4) of the frame before the first frame, if there is one.
     """
     quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
     away = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0
@@ -169,26 +171,28 @@ def continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = No
     return quaternions
 
 
-def mannequin(bind: np.ndarray) -> Mesh:
-    """Return the limbs of the bind pose (22, 3), metres, as capsules."""
-    return merge_meshes([capsule(limb.first, limb.radii, *ends(limb, bind)) for limb in LIMBS])
+def build_mannequin(bind: np.ndarray) -> Mesh:
+    """Build a mannequin from round limbs in the bind pose (22, 3), metres."""
+    return merge_meshes(
+        [build_capsule(limb.first_joint, limb.radii, *find_limb_ends(limb, bind)) for limb in LIMBS]
+    )
 
 
 def merge_meshes(parts: Sequence[Mesh]) -> Mesh:
-    """Return several meshes as one."""
+    """Merge several meshes into one."""
     starts = np.cumsum([0, *(len(part.positions) for part in parts)])
     triangles = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
     positions, normals, joints = map(np.concatenate, zip(*(part[:3] for part in parts), strict=True))
     return Mesh(positions, normals, joints, np.concatenate(triangles))
 
 
-def capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.ndarray) -> Mesh:
-    """Return a round limb that follows a joint: rings around its axis that narrow to a point at both ends.
+def build_capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.ndarray) -> Mesh:
+    """Build the mesh of a round limb that follows a joint: a cone with half spheres at its ends.
 
     Args:
         joint: the joint.
-        radii: the radii at its ends, metres.
-        start, end: its ends (3,), metres, in the bind pose.
+        radii: the limb's radii at its two ends, metres.
+        start, end: the limb's ends (3,), metres, in the bind pose.
     """
     along = (end - start) / np.linalg.norm(end - start)
     side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
@@ -196,11 +200,11 @@ def capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.n
     turn = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
     ring = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(along, side)
     cap = np.linspace(0, np.pi / 2, CAP)
-    height = np.concatenate([cap - np.pi / 2, cap])  # latitudes of the rings: start's half sphere, then end's
+    height = np.concatenate([cap - np.pi / 2, cap])  # latitudes of the rings in both half spheres
     normals = np.cos(height)[:, None, None] * ring + np.sin(height)[:, None, None] * along
     centres = np.repeat([start, end], CAP, axis=0)[:, None]
     positions = centres + np.repeat(radii, CAP)[:, None, None] * normals
-    corner = np.arange((len(normals) - 1) * AROUND)  # of the squares between the rings
+    corner = np.arange((len(normals) - 1) * AROUND)  # one corner of each square between the rings
     beside = corner // AROUND * AROUND + (corner + 1) % AROUND
     above, aslant = corner + AROUND, beside + AROUND
     triangles = np.concatenate([np.stack([corner, beside, aslant], 1), np.stack([corner, aslant, above], 1)])
@@ -209,11 +213,11 @@ def capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.n
 
 
 def write_glb(path: Path, content: dict[str, Any], buffer: Buffer) -> None:
-    """Write a file atomically: a header, a chunk of JSON, and a chunk of binary data.
+    """Write a .glb file atomically: a header, a JSON chunk, and a binary chunk.
 
     Args:
         path: the file.
-        content: the JSON, without the buffer's entries.
+        content: the JSON content without the buffer's entries.
         buffer: the binary data.
     """
     size = len(buffer.data)
@@ -239,21 +243,26 @@ _SIDES = {
 }  # fmt: skip
 
 
-def _bone(joint: str) -> str:
+def _name_bone(joint: str) -> str:
     side, _, name = joint.partition("_")
     return side.capitalize() + _SIDES[name] if name else _MIDDLE[joint]
 
 
-UNITY_BONES = tuple(_bone(joint) for joint in JOINTS)
-"""The bone of each joint, as in Unity's HumanBodyBones."""
+UNITY_BONES = tuple(_name_bone(joint) for joint in JOINTS)
+"""Each joint's bone in Unity's HumanBodyBones."""
 
 VRM_BONES = tuple(name[0].lower() + name[1:] for name in UNITY_BONES)
-"""The bone of each joint, as in VRM 1.0."""
+"""Each joint's bone in VRM 1.0."""
 
 LOOKS = (("body", (0.30, 0.42, 0.56, 1.0), 0.7), ("eyes", (0.012, 0.016, 0.022, 1.0), 0.25))
-"""Material, linear RGB and opacity, roughness."""
+"""Name of the material, its linear RGB and opacity, and its roughness."""
 
-EYES = (0.016, 0.036, 0.055, 0.100)  # metres: radius; to either side, above and before the head's joint
+EYES = (
+    0.016,
+    0.036,
+    0.055,
+    0.100,
+)  # metres: radius; distance to the side of, above and in front of the head joint
 
 META = {
     "name": "memmlp mannequin",
@@ -274,13 +283,17 @@ META = {
 
 
 def write_vrm(path: Path, rest: np.ndarray) -> None:
-    """Write a mannequin with these rest joints (22, 3), metres, as a VRM 1.0 avatar (.vrm), atomically.
+    """Write a mannequin as a VRM 1.0 avatar (.vrm), atomically. Its licence is CC0.
 
-    It stands in T-pose on the floor and faces +Z. Anybody may use it for anything (CC0).
+    It stands in T-pose on the floor and faces +Z.
+
+    Args:
+        path: the file.
+        rest: rest joints of the body (22, 3), metres.
     """
     buffer = Buffer()
     bind = rest - [0, rest[:, 1].min(), 0]
-    figure = skinned_figure(buffer, bind, [mannequin(bind), eyes(bind)])
+    figure = build_skinned_figure(buffer, bind, [build_mannequin(bind), build_eyes(bind)])
     humanoid = {"humanBones": {bone: {"node": joint} for joint, bone in enumerate(VRM_BONES)}}
     extension = {
         "extensionsUsed": ["VRMC_vrm"],
@@ -293,9 +306,11 @@ def write_vrm(path: Path, rest: np.ndarray) -> None:
     write_glb(path, {**figure, **extension, "materials": materials}, buffer)
 
 
-def eyes(bind: np.ndarray) -> Mesh:
-    """Return the eyes of a bind pose (22, 3), metres: two upright ovals on the face, which show the gaze."""
+def build_eyes(bind: np.ndarray) -> Mesh:
+    """Build the eyes for a bind pose (22, 3), metres: two upright ovals that show the head's direction."""
     radius, half, above, before = EYES
     middles = [bind[HEAD] + [side * half, above, before] for side in (-1, 1)]
     up = np.array([0, radius / 2, 0])
-    return merge_meshes([capsule(HEAD, (radius, radius), middle - up, middle + up) for middle in middles])
+    return merge_meshes(
+        [build_capsule(HEAD, (radius, radius), middle - up, middle + up) for middle in middles]
+    )

@@ -1,4 +1,4 @@
-"""Motion on a file's own skeleton, as importing reads it from any format."""
+"""Motion on a file's own skeleton: the common class for all formats that can be imported."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-END = ".end"  # an end site's name is that of its joint with this suffix
+END = ".end"  # suffix that makes an end site's name from its joint's name
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Motion on a file's own skeleton, in the file's own unit and axes; formats add `kinematics`.
+    """Motion on a file's own skeleton, in the file's unit and axes. Subclasses compute the kinematics.
 
     Attributes:
         path: the file, for messages.
-        nodes: the nodes' names, all different; a node comes after its parent.
+        nodes: names of the nodes, all different; each node comes after its parent.
         node_parents: index of each node's parent; -1 for the root.
-        offsets: each node minus its parent in the zero pose (nodes, 3).
-        fps: frames per second, as the file states them; None if it does not.
-        values: the frames' numbers (N, C), as the file has them.
+        offsets: each node's position minus its parent's in the zero pose (nodes, 3).
+        fps: frame rate in the file, Hz; None if the file has none.
+        values: the numbers of all frames in the file (N, C).
     """
 
     path: Path
@@ -34,25 +34,25 @@ class Recording:
     def __len__(self) -> int:
         return len(self.values)
 
-    def zero_pose(self) -> np.ndarray:
-        """Return the nodes' positions (nodes, 3) with all rotations zero and the root at the origin."""
+    def compute_zero_pose(self) -> np.ndarray:
+        """Compute the nodes' positions (nodes, 3) with zero rotations and the root at the origin."""
         positions = np.zeros_like(self.offsets)
         for node, parent in enumerate(self.node_parents[1:], start=1):
             positions[node] = positions[parent] + self.offsets[node]
         return positions
 
-    def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return global rotations (N, nodes, 3, 3) and positions (N, nodes, 3) of all frames."""
+    def compute_kinematics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3) of all frames."""
         raise NotImplementedError
 
-    def pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose.
+    def compute_pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
+        """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose.
 
         Args:
-            turns: node -> its rotation values as in a frame of the file; the other nodes' values are zero,
-                and the root is at the origin.
+            turns: node -> its rotation values, like in a frame of the file. The values of all other nodes are
+                zero, and the root is at the origin.
 
         Raises:
-            InputError: for a wrong number of values.
+            InputError: if a node has a wrong number of values.
         """
         raise NotImplementedError

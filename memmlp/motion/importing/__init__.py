@@ -1,1 +1,1 @@
-"""From a recording on any skeleton to clips on the 22-joint tree, and the proof that they are the same."""
+"""Imports recordings on any skeleton as clips with 22 joints, and compares clips with recordings."""

@@ -1,7 +1,7 @@
-"""Anatomy: the body's segments, tests of whether a pose is a stance, and the joints' rotations in a stance.
+"""Anatomy: the body's segments, checks whether a pose is a stance, and joint rotations in a stance.
 
-A stance is the pose of a person who stands upright. All positions (..., 22, 3) here are in Y-up axes and
-metres. `mapped` (22,) says which joints a file has.
+A stance is the pose of a person who stands upright. All positions (..., 22, 3) are in metres, with Y up.
+`mapped` (22,) is true for the joints that a file has.
 """
 
 from __future__ import annotations
@@ -17,25 +17,29 @@ from memmlp.motion.body import HEAD, JOINTS, PARENTS
 
 CHAINS = ((0, 3, 6, 9, 12, 15), (1, 4, 7, 10), (2, 5, 8, 11), (13, 16, 18, 20), (14, 17, 19, 21))
 HIPS, SHOULDERS = (1, 2), (16, 17)  # left, right
-LIMBS = {1: 4, 2: 5, 4: 7, 5: 8, 16: 18, 17: 19, 18: 20, 19: 21}  # joint -> the other end of its bone
+LIMBS = {1: 4, 2: 5, 4: 7, 5: 8, 16: 18, 17: 19, 18: 20, 19: 21}  # joint -> the end of its bone
 LEGS = {joint: end for joint, end in LIMBS.items() if joint < 6}
 FEET = {7: 10, 8: 11}
 SPINE = (3, 6, 9, 12)
 HINGES = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.0, 0.0), 16: (0.0, -1.0, 0.0), 17: (0.0, 1.0, 0.0)}
-"""Thighs and upper arms -> the axis about which the joint at their end bends, in the body's rest pose."""
+"""Hip or shoulder -> the bending axis of the knee or elbow below it, in the body's rest pose."""
 
 LEFT, UP = np.eye(3)[:2]
-LEG_LENGTH = (0.55, 1.15)  # metres from hip to ankle of adults
-TRUNK, THIGHS, SHINS = 45.0, 60.0, 75.0  # degrees: largest angles from the vertical in a stance, a runner's
-LEVEL = 30.0  # degrees: largest angle of the line of the hips from the horizontal in a stance
-ARMS = 100.0  # degrees: largest angle of an upper arm or forearm from a T-pose's in a zero pose
+LEG_LENGTH = (0.55, 1.15)  # metres from hip to ankle in adults
+TRUNK, THIGHS, SHINS = (
+    45.0,
+    60.0,
+    75.0,
+)  # degrees: maximum angles from the vertical in a stance, including running
+LEVEL = 30.0  # degrees: maximum angle between the hip line and the horizontal in a stance
+ARMS = 100.0  # degrees: maximum angle between an arm's bone and its T-pose direction in a zero pose
 SHORTEST = 1e-3  # metres
-BENT = 15.0  # degrees by which a knee or elbow must bend in a stance to show its axis
-HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # least mean sine of the bend, and agreement of its axes, in motion
+BENT = 15.0  # degrees: minimum bend of a knee or elbow that shows its axis in a stance
+HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # minimum mean sine of the bend, and minimum agreement of its axes
 
 
 class Segment(NamedTuple):
-    """The straight line from a joint to the next joint of its chain in the file. The first joint turns it."""
+    """The line from a mapped joint to the next mapped joint of a chain. The first joint rotates it."""
 
     start: int
     end: int
@@ -44,27 +48,27 @@ class Segment(NamedTuple):
         return f"{JOINTS[self.start]} to {JOINTS[self.end]}"
 
 
-def segments(mapped: np.ndarray) -> tuple[Segment, ...]:
-    """Return the segments of trunk, neck, arms, legs and feet between mapped joints."""
+def list_segments(mapped: np.ndarray) -> tuple[Segment, ...]:
+    """Return the segments between mapped joints in trunk, neck, arms, legs and feet."""
     chains = [[joint for joint in chain if mapped[joint]] for chain in CHAINS]
     return tuple(Segment(*pair) for chain in chains for pair in pairwise(chain))
 
 
-def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angles (...), degrees, between directions (..., 3); accurate at 0."""
+def compute_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angles (...), degrees, between directions (..., 3). They are accurate at 0."""
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (..., 3) with length 1."""
+def normalize_vectors(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors (..., 3) to length 1."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the smallest rotations (..., 3, 3) that turn directions (..., 3) onto others.
+def compute_least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Compute the smallest rotations (..., 3, 3) from directions `source` to directions `target` (..., 3).
 
-    For a direction without length, the identity is returned. Opposite directions are carried onto each other
-    by a half turn about one of the axes perpendicular to them.
+    A direction of length zero gives the identity. Opposite directions give a half turn about some axis
+    perpendicular to the directions.
     """
     axis, along = np.cross(source, target), (source * target).sum(-1, keepdims=True)
     norm = np.linalg.norm(axis, axis=-1, keepdims=True)
@@ -78,26 +82,28 @@ def least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape, 3)
 
 
-def align(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the rotation (3, 3) that aligns one direction exactly, and then another as far as possible.
+def align_directions(
+    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Compute the rotation (3, 3) that aligns one direction exactly, and a second one as far as possible.
 
-    Each argument is a pair: a direction, and the direction onto which it is turned.
+    Each argument is a pair of a direction and its target direction.
     """
     (a, to_a), (b, to_b) = first, second
-    once = least_rotation(a, to_a)
-    axis = unit(to_a)
+    once = compute_least_rotation(a, to_a)
+    axis = normalize_vectors(to_a)
     turned, goal = (v - (v @ axis) * axis for v in (once @ b, to_b))
     angle = np.arctan2(np.cross(turned, goal) @ axis, turned @ goal)
     return Rotation.from_rotvec(angle * axis).as_matrix() @ once
 
 
-# Whether a pose is a stance
+# Checks whether a pose is a stance
 
 
-def why_no_stance(pose: np.ndarray) -> str | None:
-    """Return why nobody stands upright in a pose (22, 3); None if somebody does.
+def find_stance_fault(pose: np.ndarray) -> str | None:
+    """Return why a pose (22, 3) is not a stance; None for a stance.
 
-    The direction that the person faces, and left and right, do not matter here.
+    The facing direction, left and right are not checked.
     """
     for start, end in ((0, HEAD), *LIMBS.items()):
         if np.linalg.norm(pose[end] - pose[start]) < SHORTEST:
@@ -105,85 +111,90 @@ def why_no_stance(pose: np.ndarray) -> str | None:
     across = pose[HIPS[0]] - pose[HIPS[1]]
     if np.linalg.norm(across) < SHORTEST:
         return "the hips are at the same place"
-    for start, end, along, most in _verticals():
-        angle = angles(pose[end] - pose[start], along)
-        if angle > most:
+    for start, end, along, max_angle in _list_vertical_segments():
+        angle = compute_angles(pose[end] - pose[start], along)
+        if angle > max_angle:
             direction = "up" if along is UP else "down"
-            return f"{JOINTS[start]} to {JOINTS[end]} is {angle:.0f} degrees from {direction}"
-    tilt = abs(90 - angles(across, UP))
+            return f"{JOINTS[start]} to {JOINTS[end]} points {angle:.0f} degrees away from {direction}"
+    tilt = abs(90 - compute_angles(across, UP))
     if tilt > LEVEL:
-        return f"the line of the hips is {tilt:.0f} degrees from level"
+        return f"the hip line is {tilt:.0f} degrees from horizontal"
     for hip in HIPS:
-        axis = bend(pose, hip)
+        axis = find_bend_axis(pose, hip)
         if axis is not None and axis @ across < 0:
             knee = JOINTS[LIMBS[hip]]
-            return f"{knee} bends forward: left and right, or the joints of the leg, may be wrong"
+            return f"{knee} bends forward, so left and right may be swapped, or leg joints may be wrong"
     return None
 
 
-def wrong_sides(pose: np.ndarray, mapped: np.ndarray) -> str | None:
-    """Return a contradiction about left and forward in a stance (22, 3); None without one."""
+def find_side_fault(pose: np.ndarray, mapped: np.ndarray) -> str | None:
+    """Return how a stance (22, 3) contradicts its left and right; None without a contradiction."""
     left = pose[HIPS[0]] - pose[HIPS[1]]
     if (pose[SHOULDERS[0]] - pose[SHOULDERS[1]]) @ left < 0:
         return "the left shoulder is on the side of the right hip"
     feet = [pose[toes] - pose[ankle] for ankle, toes in FEET.items() if mapped[ankle] and mapped[toes]]
-    if feet and unit(np.mean(feet, axis=0)) @ unit(np.cross(left, UP)) < 0:
+    if feet and normalize_vectors(np.mean(feet, axis=0)) @ normalize_vectors(np.cross(left, UP)) < 0:
         return "the feet point backward, so left and right may be swapped"
     return None
 
 
-def arms_lifted(pose: np.ndarray) -> bool:
-    """Return whether an arm of a stance that faces +Z (22, 3) is far from a T-pose's."""
+def has_raised_arm(pose: np.ndarray) -> bool:
+    """Return whether an arm points far from its T-pose direction in a stance (22, 3) that faces +Z."""
     ends = ((16, 18, LEFT), (18, 20, LEFT), (17, 19, -LEFT), (19, 21, -LEFT))
-    return any(angles(pose[end] - pose[start], along) > ARMS for start, end, along in ends)
+    return any(compute_angles(pose[end] - pose[start], along) > ARMS for start, end, along in ends)
 
 
-def unevenness(poses: np.ndarray) -> np.ndarray:
-    """Return how far poses (N, 22, 3) are from standing straight, as sums of angles (N,), degrees."""
-    total = sum(angles(poses[:, end] - poses[:, start], along) for start, end, along, _ in _verticals())
+def measure_unevenness(poses: np.ndarray) -> np.ndarray:
+    """Measure how far poses (N, 22, 3) differ from a straight stance: sums of angles (N,), degrees."""
+    total = sum(
+        compute_angles(poses[:, end] - poses[:, start], along)
+        for start, end, along, _ in _list_vertical_segments()
+    )
     left, across = (poses[:, a] - poses[:, b] for a, b in (HIPS, SHOULDERS))
     arms = ((16, 18, 20), (17, 19, 21))
-    bends = [angles(poses[:, e] - poses[:, m], poses[:, m] - poses[:, s]) for s, m, e in arms]
-    return total + np.abs(90 - angles(left, UP)) + angles(left, across) + 0.5 * sum(bends)
+    bends = [compute_angles(poses[:, e] - poses[:, m], poses[:, m] - poses[:, s]) for s, m, e in arms]
+    return total + np.abs(90 - compute_angles(left, UP)) + compute_angles(left, across) + 0.5 * sum(bends)
 
 
-def facing(pose: np.ndarray) -> np.ndarray:
-    """Return the turn (3, 3) about the vertical after which a stance (22, 3) has its left on +X."""
+def find_facing_turn(pose: np.ndarray) -> np.ndarray:
+    """Find the rotation (3, 3) about the vertical that makes a stance (22, 3) face +Z, with left on +X."""
     left = pose[HIPS[0]] - pose[HIPS[1]]
     return Rotation.from_rotvec(np.arctan2(left[2], left[0]) * UP).as_matrix()
 
 
-def _verticals() -> Iterator[tuple[int, int, np.ndarray, float]]:
-    """Yield the segments that are vertical in a stance, their direction, and the tolerance in degrees."""
+def _list_vertical_segments() -> Iterator[tuple[int, int, np.ndarray, float]]:
+    """Yield the vertical segments of a stance: start, end, direction, and tolerance in degrees."""
     yield 0, HEAD, UP, TRUNK
     for start, end in LEGS.items():
         yield start, end, -UP, THIGHS if start in HIPS else SHINS
 
 
-# The joints' rotations in a stance
+# Joint rotations in a stance
 
 
-def orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return the rotations (22, 3, 3) of a body's joints that make it stand as in a stance (22, 3) facing +Z.
+def compute_orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Compute the rotations (22, 3, 3) that pose a body like a stance (22, 3) that faces +Z.
 
-    Every segment points as in the stance. About its own axis, the pelvis follows the hips, the chest the
-    shoulders, and the spine both. Upper limbs take the smallest rotation from the body's rest pose (22, 3),
-    lower limbs the smallest rotation from the upper ones. The head is upright and faces in the direction of
-    the chest. Wrists and toes continue straight.
+    Every segment has its direction in the stance. The twist of the pelvis follows the hips, the twist of the
+    chest follows the shoulders, and the spine is between them. Upper limbs get the smallest rotation from the
+    body's rest pose (22, 3). Lower limbs get the smallest rotation from the upper limbs. The head is upright
+    and faces in the direction of the chest. Wrists and toes have the rotation of their parents.
     """
 
     def is_long(start: int, end: int) -> bool:
         return bool(np.linalg.norm(stance[end] - stance[start]) > SHORTEST)
 
     result = np.tile(np.eye(3), (len(JOINTS), 1, 1))
-    ends = {segment.start: segment.end for segment in segments(mapped)}
-    hips, shoulders = (unit(stance[left] - stance[right]) for left, right in (HIPS, SHOULDERS))
-    chest = align((UP, UP), (LEFT, shoulders))
+    ends = {segment.start: segment.end for segment in list_segments(mapped)}
+    hips, shoulders = (normalize_vectors(stance[left] - stance[right]) for left, right in (HIPS, SHOULDERS))
+    chest = align_directions((UP, UP), (LEFT, shoulders))
     trunk = next(end for end in (*SPINE, HEAD) if is_long(0, end) and mapped[end])
-    result[0] = align((rest[1] - rest[2], hips), (rest[trunk] - rest[0], stance[trunk] - stance[0]))
+    result[0] = align_directions(
+        (rest[1] - rest[2], hips), (rest[trunk] - rest[0], stance[trunk] - stance[0])
+    )
     for step, joint in enumerate(SPINE, start=1):
-        left = unit(hips + min(step / 3, 1.0) * (shoulders - hips))
-        result[joint] = align((UP, UP), (LEFT, left))
+        left = normalize_vectors(hips + min(step / 3, 1.0) * (shoulders - hips))
+        result[joint] = align_directions((UP, UP), (LEFT, left))
     result[HEAD] = chest
     for joint in range(1, len(JOINTS)):
         parent = PARENTS[joint]
@@ -196,32 +207,39 @@ def orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np
             result[joint] = result[joint] if joint == HEAD else result[parent]
         elif is_long(joint, end):
             bone = result[joint] @ (rest[end] - rest[joint])
-            result[joint] = least_rotation(bone, stance[end] - stance[joint]) @ result[joint]
+            result[joint] = compute_least_rotation(bone, stance[end] - stance[joint]) @ result[joint]
     return result
 
 
-def bend(stance: np.ndarray, joint: int) -> np.ndarray | None:
-    """Return the axis (3,) of a knee or elbow that is bent in a stance (22, 3); None if it is straight."""
+def find_bend_axis(stance: np.ndarray, joint: int) -> np.ndarray | None:
+    """Find the bending axis (3,) of a knee or elbow in a stance (22, 3); None if the limb is straight.
+
+    Args:
+        stance: the pose.
+        joint: the hip or shoulder above the knee or elbow."""
     middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
     upper, lower = stance[middle] - stance[joint], stance[end] - stance[middle]
-    return unit(np.cross(upper, lower)) if angles(upper, lower) > BENT else None
+    return normalize_vectors(np.cross(upper, lower)) if compute_angles(upper, lower) > BENT else None
 
 
-def hinge(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | None:
-    """Find the bending axis of the joint at the end of a thigh or upper arm, from the motion.
+def find_hinge_axis(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | None:
+    """Find the bending axis of a knee or elbow from the motion.
 
     Args:
         upper: global rotations (N, 3, 3) of the thigh or upper arm.
-        positions: the joints' positions (N, 22, 3).
-        joint: the joint that turns the thigh or upper arm, one of `HINGES`.
+        positions: joint positions (N, 22, 3).
+        joint: the hip or shoulder above the knee or elbow, one of `HINGES`.
 
     Returns:
-        The axis (3,) in the thigh's or upper arm's own frame; None if it bends too little, or about too many
-        axes.
+        The axis (3,) in the frame of the thigh or upper arm; None if the limb bends too little or about
+        different axes.
     """
     middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
-    bones = unit(positions[:, middle] - positions[:, joint]), unit(positions[:, end] - positions[:, middle])
+    bones = (
+        normalize_vectors(positions[:, middle] - positions[:, joint]),
+        normalize_vectors(positions[:, end] - positions[:, middle]),
+    )
     bends = np.einsum("nij,ni->nj", upper, np.cross(*bones))
     total, sizes = bends.sum(0), np.linalg.norm(bends, axis=-1)
     is_clear = sizes.mean() > HINGE_BEND and np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
-    return unit(total) if is_clear else None
+    return normalize_vectors(total) if is_clear else None

@@ -1,18 +1,19 @@
-"""Converts a recording to a clip on the 22-joint tree, by a skeleton map: stance, rotations, floor, check.
+"""Converts a recording to a clip with 22 joints, by a skeleton map.
 
-A file's node and its body joint have the same global rotation, up to a constant correction on the right. The
-corrections come from one pose, the stance: the person stands in it, so the rotations of the body's joints are
-known (`anatomy.orientations`), whatever the file's zero pose is. A zero pose may be a
-T-pose, or a pose that no standing person has: bones along one axis, a folded body, a person who lies. Then a
-frame of the motion is used, or rotations that the skeleton map gives.
+A body joint has the global rotation of its node in the file, times a constant correction on the right. The
+corrections come from one pose, the stance, in which the person stands upright. For a stance, the rotations of
+the body joints can be computed (`anatomy.compute_orientations`). The file's zero pose is the stance if a
+person stands in it. If not, for example if all bones lie along one axis, the stance is a frame of the motion,
+or a pose in the skeleton map.
 
-Where an unmapped joint between two mapped ones turns, the correction is not constant: the segment between
-them is then turned by the least rotation to its direction in the file. A body joint without a counterpart
-takes its parent's rotation.
+The correction is not constant if an unmapped joint between two mapped joints turns. So each segment is also
+turned to its direction in the file, by the smallest rotation. A body joint without a node has its parent's
+rotation.
 
-Up is the direction of the head in the zero pose, if that is a person who stands, also if the person lies in
-the motion. If the motion has the head along the other axis, it can mean two things: a person who lies all the
-time, or one who walks while only the root's rotation has the other axis up. Then the user has to decide.
+If a person stands in the zero pose, the head is up in this pose, even if the person lies in the motion. If
+the head is along a different axis in the motion, there are two explanations. The person may lie all the time.
+Or the person walks, and the root's rotation has a different up axis than the zero pose. Then the user has to
+decide.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import HEAD, JOINTS, PARENTS
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.recording import Recording
-from memmlp.motion.geometry import clip_kinematics
+from memmlp.motion.geometry import compute_clip_kinematics
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.anatomy import (
     FEET,
@@ -36,10 +37,10 @@ from memmlp.motion.importing.anatomy import (
     LEGS,
     LIMBS,
     Segment,
-    least_rotation,
-    segments,
+    compute_least_rotation,
+    list_segments,
 )
-from memmlp.motion.importing.fidelity import Fidelity, compare
+from memmlp.motion.importing.fidelity import Fidelity, compare_with_recording
 from memmlp.motion.importing.skeleton_map import (
     REQUIRED,
     UPRIGHT,
@@ -49,24 +50,24 @@ from memmlp.motion.importing.skeleton_map import (
     pick_joints,
 )
 
-AUTO, NONE = "auto", "none"  # options of the floor, beside a height
+AUTO, NONE = "auto", "none"  # options for the floor, besides a height
 
 UNITS = (1.0, 0.1, 0.0254 / 0.45, 0.0254, 0.01, 0.001)  # metres; 0.0254 / 0.45 is CMU's inch
-GIVEN_LEG = (0.3, 1.5)  # metres that a given unit may result in: children, giants
-UPRIGHT_SHARE = 0.5  # least mean share of the way from pelvis to head along an up axis that is found
+GIVEN_LEG = (0.3, 1.5)  # metres: range of leg lengths with a given unit, from children to giants
+UPRIGHT_SHARE = 0.5  # minimum mean component of the direction from pelvis to head along the up axis
 
 POSITION_LIMIT = 1e4  # metres, as in `read_clip`
 HIP_LINE = Segment(HIPS[1], HIPS[0])
 STRAIGHTEST = "the straightest frame"
-TRIED = 500  # frames of a file, evenly spread, among which a stance is looked for
+TRIED = 500  # maximum number of evenly spaced frames in the search for a stance
 
-CONTACT = 0.02  # metres: height of the toe joint above the floor it stands on (the built-in body's)
-STANDING_SPEED = 0.15  # metres a second: a toe that stands is slower
-SECONDS = 0.2  # toes must stand as long in all for a floor to be known
-LOWEST = 0.05  # share of the standing toes that may be lower: noise, and feet that sink in
+CONTACT = 0.02  # metres: height of a standing toe joint above the floor, on the built-in body
+STANDING_SPEED = 0.15  # m/s: maximum speed of a standing toe
+SECONDS = 0.2  # minimum total time of standing toes that shows the floor
+LOWEST = 0.05  # fraction of standing toes that may be below the floor, because of noise
 
-JUMP = 4.0  # first steps from which on frame 0 is a calibration pose
-JUMPED = 0.05  # a smaller step, in multiples of the skeleton's size, does not count
+JUMP = 4.0  # minimum first step (`measure_first_step`) of a calibration pose in frame 0
+JUMPED = 0.05  # multiples of the skeleton's size: smaller first steps are ignored
 
 
 @dataclass(frozen=True)
@@ -74,11 +75,10 @@ class Conversion:
     """A recording converted to the body.
 
     Attributes:
-        clip: the motion, world (Z up), with its floor at 0 if the floor is known.
+        clip: the motion, world (Z up). A known floor is at height 0.
         fitted: the constants of the conversion.
-        fidelity: the deviation of the clip from the file's motion, and its faults.
-        floor: height of the floor in the recording, metres on the body's scale, which was subtracted; None if
-            it is unknown or was not asked for.
+        fidelity: the deviation between clip and recording, and the clip's likely mistakes.
+        floor: the subtracted height of the floor, metres at the body's scale; None if nothing was subtracted.
     """
 
     clip: Clip
@@ -87,7 +87,7 @@ class Conversion:
     floor: float | None
 
 
-def convert(
+def convert_recording(
     recording: Recording,
     skeleton: SkeletonMap,
     rest: np.ndarray,
@@ -96,7 +96,7 @@ def convert(
     fps: float,
     floor: str | float = AUTO,
 ) -> Conversion:
-    """Convert a recording to a body.
+    """Convert a recording to a clip on a body.
 
     Args:
         recording: the file's motion.
@@ -104,19 +104,20 @@ def convert(
         rest: the body's rest joints (22, 3), metres.
         name: the clip's name.
         fps: the true frame rate, Hz.
-        floor: `auto`, found from the feet; `none`, left as it is; or the floor's height in the file, metres.
+        floor: `auto`: find the floor from the feet; `none`: keep all heights; or the floor's height in the
+            file, metres.
 
     Raises:
-        InputError: as `pick_joints` and `fit` do.
+        InputError: for the reasons in `pick_joints` and `fit_skeleton`.
     """
-    fitted = fit(recording, skeleton, rest)
-    clip = to_body(fitted, rest, name, fps)
+    fitted = fit_skeleton(recording, skeleton, rest)
+    clip = convert_to_body(fitted, rest, name, fps)
     if floor == AUTO:
-        height = find_floor(clip_kinematics(clip, rest)[1], clip.fps)
+        height = find_floor(compute_clip_kinematics(clip, rest)[1], clip.fps)
     else:
         height = None if floor == NONE else float(floor) * fitted.scale
     clip = replace(clip, trans=clip.trans - [0.0, 0.0, height or 0.0])
-    return Conversion(clip, fitted, compare(clip, fitted.motion, rest, skeleton.name), height)
+    return Conversion(clip, fitted, compare_with_recording(clip, fitted.motion, rest, skeleton.name), height)
 
 
 # Stance and conversion
@@ -124,14 +125,14 @@ def convert(
 
 @dataclass(frozen=True)
 class Stance:
-    """A stance, turned so that the person faces +Z (Y up, metres).
+    """A stance in which the person faces +Z (Y up, metres).
 
     Attributes:
         rotations: global rotations (22, 3, 3) of the mapped joints' nodes.
-        positions: their positions (22, 3).
-        nodes: positions (nodes, 3) of all of the file's nodes.
-        source: a description of the file's pose.
-        straight: whether the limbs are as in the zero pose, and so assumed to have no twist.
+        positions: positions (22, 3) of the mapped joints' nodes.
+        nodes: positions (nodes, 3) of all nodes in the file.
+        source: a description of the pose in the file.
+        straight: whether the limbs have zero rotations, and so are assumed to be without twist.
     """
 
     rotations: np.ndarray
@@ -146,10 +147,10 @@ class Retargeting:
     """The motion of a recording's mapped joints, and the constants that convert it to a body.
 
     Attributes:
-        skeleton: the recording's skeleton map, with unit and up axis filled in.
+        skeleton: the recording's skeleton map, with a known unit and up axis.
         motion: the mapped joints' motion.
-        stance: the pose from which the corrections follow.
-        corrections: (22, 3, 3), on the right of the rotations of the mapped nodes, in Y-up axes.
+        stance: the pose that determines the corrections.
+        corrections: rotations (22, 3, 3), multiplied on the right of the nodes' rotations, in Y-up axes.
         scale: the body's leg length divided by the recording's.
     """
 
@@ -161,87 +162,87 @@ class Retargeting:
 
 
 def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotion) -> Stance:
-    """Find the stance of a file: the map's, else the zero pose, else the straightest frame.
+    """Find the stance of a file: the rest pose in the map, else the zero pose, else the straightest frame.
 
     Raises:
-        InputError: if there is no such pose, or its left and right contradict each other.
+        InputError: if the file has no stance, or the left and right of the stance contradict each other.
     """
     upright, positions, path = skeleton.upright, motion.positions, recording.path
 
     def stance(rotations: np.ndarray, pose: np.ndarray, nodes: np.ndarray, source: str) -> Stance:
-        if (why := anatomy.wrong_sides(pose, motion.mapped)) is not None:
-            raise InputError(f"{path}: in {source}, {why}; check left and right in the map, and the up axis")
-        turn = anatomy.facing(pose)
+        if (why := anatomy.find_side_fault(pose, motion.mapped)) is not None:
+            raise InputError(f"{path}: in {source}, {why}; check left and right in the map and the up axis")
+        turn = anatomy.find_facing_turn(pose)
         nodes = skeleton.unit * nodes @ upright.T @ turn.T
         straight = np.allclose(rotations[[*LIMBS]], np.eye(3))
         return Stance(turn @ rotations, pose @ turn.T, nodes, source, straight)
 
     if skeleton.rest is not None:
-        rotations, nodes = recording.pose(skeleton.rest)
+        rotations, nodes = recording.compute_pose(skeleton.rest)
         pose = skeleton.unit * nodes[motion.nodes] @ upright.T
-        if (why := anatomy.why_no_stance(pose)) is not None:
-            raise InputError(f"{path}: rest of skeleton {skeleton.name}: {why}; must be an upright stance")
+        if (why := anatomy.find_stance_fault(pose)) is not None:
+            raise InputError(f"{path}: rest in skeleton {skeleton.name} must be an upright stance, but {why}")
         return stance(upright @ rotations[motion.nodes] @ upright.T, pose, nodes, "the map's rest pose")
-    why = anatomy.why_no_stance(motion.zero)
+    why = anatomy.find_stance_fault(motion.zero)
     if why is None:
-        eyes = np.tile(np.eye(3), (len(motion.zero), 1, 1))
-        zero = stance(eyes, motion.zero, recording.zero_pose(), "the zero pose")
-        if not anatomy.arms_lifted(zero.positions):
+        identities = np.tile(np.eye(3), (len(motion.zero), 1, 1))
+        zero = stance(identities, motion.zero, recording.compute_zero_pose(), "the zero pose")
+        if not anatomy.has_raised_arm(zero.positions):
             return zero
-        why = "an arm is more than 100 degrees from a T-pose's"
+        why = "an arm points more than 100 degrees away from its T-pose direction"
     frames = np.unique(np.linspace(0, len(motion) - 1, TRIED).astype(int))
-    order = frames[np.argsort(anatomy.unevenness(positions[frames]), kind="stable")]
-    standing = [int(frame) for frame in order if anatomy.why_no_stance(positions[frame]) is None]
+    order = frames[np.argsort(anatomy.measure_unevenness(positions[frames]), kind="stable")]
+    standing = [int(frame) for frame in order if anatomy.find_stance_fault(positions[frame]) is None]
     if not standing:
-        best = anatomy.why_no_stance(positions[order[0]])
+        best = anatomy.find_stance_fault(positions[order[0]])
         raise InputError(
-            f"{path}: the person stands neither in the zero pose ({why}) nor in any frame (at best, {best}); "
-            "check up and joints in the map, or give it a rest"
+            f"{path}: the person stands neither in the zero pose ({why}) nor in a frame (best: {best}); "
+            "check up and joints in the map, or add rest to it"
         )
-    sound = (frame for frame in standing if anatomy.wrong_sides(positions[frame], motion.mapped) is None)
+    sound = (frame for frame in standing if anatomy.find_side_fault(positions[frame], motion.mapped) is None)
     frame = next(sound, standing[0])
-    nodes = recording.kinematics()[1][frame + int(skeleton.calibration_frame)]
+    nodes = recording.compute_kinematics()[1][frame + int(skeleton.calibration_frame)]
     return stance(motion.rotations[frame], positions[frame], nodes, f"{STRAIGHTEST} {frame}")
 
 
-def fit(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Retargeting:
+def fit_skeleton(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Retargeting:
     """Fit a recording's skeleton to a body's rest joints (22, 3), metres.
 
     Raises:
-        InputError: if the file shows no unit, up axis or standing person, or left and right contradict each
+        InputError: if the unit, the up axis or a stance cannot be found, or if left and right contradict each
             other.
     """
     skeleton = find_unit_and_up(recording, skeleton)
     motion = pick_joints(recording, skeleton)
     stance = find_stance(recording, skeleton, motion)
-    turned = anatomy.orientations(stance.positions, motion.mapped, rest)
+    turned = anatomy.compute_orientations(stance.positions, motion.mapped, rest)
     if not stance.straight:
-        _turn_to_hinges(turned, stance, motion, rest)
+        _align_bend_axes(turned, stance, motion, rest)
     corrections = stance.rotations.swapaxes(-1, -2) @ turned
-    scale = float(_leg_length(rest) / np.median(_leg_length(motion.positions)))
+    scale = float(_measure_legs(rest) / np.median(_measure_legs(motion.positions)))
     return Retargeting(skeleton, motion, stance, corrections, scale)
 
 
-def to_body(fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Clip:
-    """Return mapped motion as a clip on the body that it was fitted to, in the world (Z up).
+def convert_to_body(fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Clip:
+    """Convert mapped motion to a clip on a body, in the world (Z up).
 
-    The middle of the hips is at its place in the recording, scaled by the ratio of leg lengths.
+    The midpoint of the hips has its position in the recording, scaled by the ratio of leg lengths.
 
     Args:
-        fitted: the result of `fit`.
+        fitted: the result of `fit_skeleton` for this body.
         rest: the body's rest joints (22, 3), metres.
         name: the clip's name.
         fps: the true frame rate, Hz.
 
     Raises:
-        InputError: if the person is more than 10 km from the origin.
+        InputError: if the person is farther than 10 km from the origin.
     """
     motion = fitted.motion
     turned = Z_UP @ _aim_segments(motion, motion.rotations @ fitted.corrections, rest)
     hips = fitted.scale * motion.positions[:, list(HIPS)].mean(1) @ Z_UP.T
     trans = hips - turned[:, 0] @ (rest[list(HIPS)].mean(0) - rest[0]) - rest[0]
     if np.abs(trans).max() > POSITION_LIMIT:
-        far = f"{np.abs(trans).max():.3g} m from the origin"
+        far = f"the person is {np.abs(trans).max():.3g} m from the origin"
         raise InputError(f"{motion.path}: {far}; must be within {POSITION_LIMIT:g} m")
     local = turned.copy()
     local[:, 1:] = turned[:, list(PARENTS[1:])].swapaxes(-1, -2) @ turned[:, 1:]
@@ -250,58 +251,60 @@ def to_body(fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Cli
 
 
 def _aim_segments(motion: MappedMotion, turned: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Turn rotations (N, 22, 3, 3), in place, so that their segments point as in the recording."""
-    for start, end in (HIP_LINE, *segments(motion.mapped)):
+    """Turn rotations (N, 22, 3, 3) in place until all segments have their directions in the recording."""
+    for start, end in (HIP_LINE, *list_segments(motion.mapped)):
         joint = 0 if (start, end) == HIP_LINE else start
         if joint > 0 or (start, end) == HIP_LINE:
             there = motion.positions[:, end] - motion.positions[:, start]
             bone = turned[:, joint] @ (rest[end] - rest[start])
-            turned[:, joint] = least_rotation(bone, there) @ turned[:, joint]
+            turned[:, joint] = compute_least_rotation(bone, there) @ turned[:, joint]
     for joint in map(int, np.flatnonzero(~motion.mapped)):
         turned[:, joint] = turned[:, PARENTS[joint]]
     return turned
 
 
-def _turn_to_hinges(turned: np.ndarray, stance: Stance, motion: MappedMotion, rest: np.ndarray) -> None:
-    """Turn thighs and upper arms about themselves, in place, so that knees and elbows bend about their axes.
+def _align_bend_axes(rotations: np.ndarray, stance: Stance, motion: MappedMotion, rest: np.ndarray) -> None:
+    """Twist thighs and upper arms in place until the knees' and elbows' bending axes fit the recording.
 
-    The axes are found from the stance if the limb is bent in it, otherwise from the motion.
+    The axes come from the stance if the limb is bent there, otherwise from the motion.
     """
     for joint, rest_axis in HINGES.items():
-        axis = anatomy.bend(stance.positions, joint)
+        axis = anatomy.find_bend_axis(stance.positions, joint)
         if axis is None:
-            own = anatomy.hinge(motion.rotations[:, joint], motion.positions, joint)
-            axis = None if own is None else stance.rotations[joint] @ own
+            local_axis = anatomy.find_hinge_axis(motion.rotations[:, joint], motion.positions, joint)
+            axis = None if local_axis is None else stance.rotations[joint] @ local_axis
         if axis is None:
             continue
         middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
-        along = turned[joint] @ (rest[middle] - rest[joint])
-        turned[joint] = (
-            anatomy.align((along, along), (turned[joint] @ np.array(rest_axis), axis)) @ turned[joint]
+        along = rotations[joint] @ (rest[middle] - rest[joint])
+        rotations[joint] = (
+            anatomy.align_directions((along, along), (rotations[joint] @ np.array(rest_axis), axis))
+            @ rotations[joint]
         )
-        lower = turned[joint] @ (rest[end] - rest[middle])
+        lower = rotations[joint] @ (rest[end] - rest[middle])
         there = stance.positions[end] - stance.positions[middle]
-        turned[middle] = least_rotation(lower, there) @ turned[joint]
+        rotations[middle] = compute_least_rotation(lower, there) @ rotations[joint]
         if end in (20, 21):
-            turned[end] = turned[middle]
+            rotations[end] = rotations[middle]
 
 
-def _leg_length(positions: np.ndarray) -> np.ndarray:
-    """Return the lengths (...) of thigh plus shin in positions (..., 22, 3), averaged over both sides."""
+def _measure_legs(positions: np.ndarray) -> np.ndarray:
+    """Measure the lengths (...) of thigh plus shin in positions (..., 22, 3), averaged over both sides."""
     bones = [positions[..., end, :] - positions[..., start, :] for start, end in LEGS.items()]
     return np.linalg.norm(bones, axis=-1).sum(0) / 2
 
 
 @dataclass(frozen=True)
 class StanceView:
-    """The stance of a skeleton with all nodes: facing +Z, Y up, left on +X, in metres.
+    """The stance of a skeleton with all nodes, in metres: Y up, facing +Z, left on +X.
 
     Attributes:
-        nodes: the nodes' names; parents: the index of each node's parent, -1 for the root.
-        positions: the nodes' positions (nodes, 3).
+        nodes: names of the nodes.
+        parents: index of each node's parent; -1 for the root.
+        positions: positions of the nodes (nodes, 3).
         mapped: body joint -> index of its node.
-        body: the body's joints (22, 3) in the same stance, the pelvis at the origin.
-        source: a description of the file's pose.
+        body: joint positions of the body (22, 3) in the same stance, with the pelvis at the origin.
+        source: a description of the pose in the file.
     """
 
     nodes: tuple[str, ...]
@@ -313,17 +316,17 @@ class StanceView:
 
 
 def view_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> StanceView:
-    """Return the stance that an import uses for a file's skeleton, and the body in it.
+    """Return the stance that an import uses for a file's skeleton, and the body in this stance.
 
     Args:
         recording: the file's motion.
-        skeleton: the file's skeleton map, with the nodes spelt as in the file.
+        skeleton: the file's skeleton map, with the file's spelling of the nodes.
         rest: the body's rest joints (22, 3), metres.
 
     Raises:
-        InputError: as `convert` does.
+        InputError: for the reasons in `convert_recording`.
     """
-    fitted = fit(recording, skeleton, rest)
+    fitted = fit_skeleton(recording, skeleton, rest)
     stance = fitted.stance
     rotations, body = stance.rotations @ fitted.corrections, np.zeros_like(rest)
     for joint, parent in enumerate(PARENTS[1:], start=1):
@@ -336,19 +339,19 @@ def view_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
 
 
 def find_unit_and_up(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap:
-    """Return the map with unit and up axis filled in from the recording, where the map lacks them.
+    """Return a copy of the map in which a missing unit or up axis is found from the recording.
 
     Raises:
-        InputError: if they can't be found, or if a given unit makes the legs too short or long for a person.
+        InputError: if unit or up axis can't be found, or if the map's unit gives implausible leg lengths.
     """
     nodes = {
         joint: recording.nodes.index(node)
         for joint, node in skeleton.joints.items()
         if node in recording.nodes
     }
-    positions = recording.kinematics()[1][int(skeleton.calibration_frame) :]
+    positions = recording.compute_kinematics()[1][int(skeleton.calibration_frame) :]
     if not {JOINTS[joint] for joint in (0, HEAD, *LEGS, *LEGS.values())} <= set(nodes) or not len(positions):
-        return skeleton  # `pick_joints` reports it
+        return skeleton  # `pick_joints` reports missing nodes
     bones = [
         positions[:, nodes[JOINTS[end]]] - positions[:, nodes[JOINTS[start]]] for start, end in LEGS.items()
     ]
@@ -362,51 +365,56 @@ def find_unit_and_up(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap
 
 
 def _find_unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
-    """Return the unit, metres, of a file with legs of the given length."""
+    """Return the file's unit in metres, given the length of the legs in the file's unit."""
     if skeleton.unit is not None:
         low, high = GIVEN_LEG
         if not low <= leg * skeleton.unit <= high:
             raise InputError(
-                f"{recording.path}: unit={skeleton.unit:g} of {skeleton.name} makes the legs "
-                f"{leg * skeleton.unit:.3g} m long; must give {low:g} to {high:g} m"
+                f"{recording.path}: with unit={skeleton.unit:g} in skeleton {skeleton.name}, the legs are "
+                f"{leg * skeleton.unit:.3g} m long; must be {low:g} to {high:g} m"
             )
         return skeleton.unit
     fitting = [unit for unit in UNITS if LEG_LENGTH[0] <= leg * unit <= LEG_LENGTH[1]]
     if not fitting:
         raise InputError(
-            f"{recording.path}: the legs are {leg:.3g} long in the file's unit, which is not one of "
-            f"{', '.join(f'{unit:.4g}' for unit in UNITS)} m; give the unit in the skeleton's map"
+            f"{recording.path}: no unit found, because the legs are {leg:.3g} units long; set unit in the "
+            f"skeleton map (tried {', '.join(f'{unit:.4g}' for unit in UNITS)} m)"
         )
     return min(fitting, key=lambda unit: abs(leg * unit - 0.85))
 
 
 def _find_up(recording: Recording, trunk: np.ndarray, nodes: dict[str, int]) -> str:
-    """Return the axis, `y` or `z`, that is up in a file, from the vectors from pelvis to head (N, 3)."""
+    """Find the up axis of a file, `y` or `z`.
+
+    Args:
+        recording: the file's motion.
+        trunk: vectors from pelvis to head (N, 3).
+        nodes: body joint -> index of its node."""
     mean = (trunk / np.linalg.norm(trunk, axis=-1, keepdims=True).clip(1e-9)).mean(0)
     along = {"y": float(mean[1]), "z": float(mean[2])}
     moving = max(along, key=lambda axis: along[axis])
     standing = None
     if set(REQUIRED) <= set(nodes):
-        zero, pose = recording.zero_pose(), np.zeros((len(JOINTS), 3))
+        zero, pose = recording.compute_zero_pose(), np.zeros((len(JOINTS), 3))
         for joint, node in nodes.items():
             pose[JOINTS.index(joint)] = zero[node]
         standing = next(
-            (a for a, turn in UPRIGHT.items() if anatomy.why_no_stance(pose @ turn.T) is None), None
+            (a for a, turn in UPRIGHT.items() if anatomy.find_stance_fault(pose @ turn.T) is None), None
         )
     upright = along[moving] >= UPRIGHT_SHARE
     if upright and standing in (None, moving):
         return moving
-    advice = "give --up y or z, or up in the skeleton's map"
+    advice = "set --up y or --up z, or up in the skeleton map"
     if standing is None or along[standing] <= -UPRIGHT_SHARE:
         x, y, z = mean
         raise InputError(
-            f"{recording.path}: no up axis found, as the head is along ({x:.2f}, {y:.2f}, {z:.2f}) from the "
-            f"pelvis on average; {advice}"
+            f"{recording.path}: no up axis found, because the mean direction from pelvis to head is "
+            f"({x:.2f}, {y:.2f}, {z:.2f}); {advice}"
         )
     if upright:
         raise InputError(
             f"{recording.path}: the person stands along {standing} in the zero pose, but along {moving} in "
-            f"the motion; {advice}: --up {standing} if the person lies, else --up {moving}"
+            f"the motion; set --up {standing} if the person lies in the motion, otherwise --up {moving}"
         )
     return standing
 
@@ -415,16 +423,16 @@ def _find_up(recording: Recording, trunk: np.ndarray, nodes: dict[str, int]) -> 
 
 
 def find_floor(positions: np.ndarray, fps: float) -> float | None:
-    """Return the height of the floor, metres.
+    """Find the height of the floor, metres.
 
-    It is below nearly all toes that stand still, and not above the lowest joint in nearly all frames.
+    The floor is below nearly all standing toes. In nearly all frames, it is not above the lowest joint.
 
     Args:
-        positions: global joint positions (N, 22, 3), world (Z up).
+        positions: joint positions (N, 22, 3), metres, world (Z up).
         fps: frames per second.
 
     Returns:
-        None if no toe stands long enough to show the floor's height.
+        The height; None if no toe stands still for long enough.
     """
     toes = positions[:, list(FEET.values())]
     if len(toes) < 2:
@@ -433,20 +441,19 @@ def find_floor(positions: np.ndarray, fps: float) -> float | None:
     standing = toes[..., 2][speed < STANDING_SPEED]
     if len(standing) < SECONDS * fps:
         return None
-    lowest = np.quantile(positions[..., 2].min(1), LOWEST)  # for people who lie, with their toes up
+    lowest = np.quantile(positions[..., 2].min(1), LOWEST)  # for people who lie with raised toes
     return float(min(np.quantile(standing, LOWEST) - CONTACT, lowest))
 
 
-def first_step(recording: Recording) -> float:
-    """Return the step from frame 0 to frame 1, divided by the 90 % quantile of all later steps.
+def measure_first_step(recording: Recording) -> float:
+    """Measure the step from frame 0 to frame 1, relative to the 90 % quantile of all later steps.
 
-    A step is the largest distance that a node moves relative to the root. The result is 0 for a short
-    recording, or if the first step is small compared with the body. Beyond `JUMP`, frame 0 is a calibration
-    pose, such as a T-pose, and not motion.
+    A step is the maximum distance that a node moves relative to the root. The result is 0 for a short
+    recording or a small step. Above `JUMP`, frame 0 is a calibration pose, such as a T-pose.
     """
     if len(recording) < 4:
         return 0.0
-    positions = recording.kinematics()[1]
+    positions = recording.compute_kinematics()[1]
     pose = positions - positions[:, :1]
     steps = np.linalg.norm(np.diff(pose, axis=0), axis=-1).max(-1)
     if steps[0] <= JUMPED * np.linalg.norm(pose[0], axis=-1).max():

@@ -1,7 +1,8 @@
-"""A skeleton map proposed for a file: the limbs by the words in its nodes' names, the trunk by its tree.
+"""Proposes a skeleton map for a file. The names of nodes show the limbs, and the tree shows the trunk.
 
-Joints of arms and legs are found by known words, each below the one before it. Between pelvis and arms, the
-spine is spread over the nodes; the head is the node of that name, else the end of the line above the arms.
+Joints of arms and legs are found by typical words, each below the previous joint. The spine joints are spread
+over the nodes between pelvis and arms. The head is a node named head, or else the end of the longest chain
+above the arms.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, make_builtin_rest_joints
 from memmlp.motion.formats.recording import END, Recording
 from memmlp.motion.importing.anatomy import CHAINS
-from memmlp.motion.importing.convert import JUMP, Conversion, convert, first_step
-from memmlp.motion.importing.skeleton_map import REQUIRED, SkeletonMap, without_namespace
+from memmlp.motion.importing.convert import JUMP, Conversion, convert_recording, measure_first_step
+from memmlp.motion.importing.skeleton_map import REQUIRED, SkeletonMap, strip_namespace
 
-LEG = {  # joint of a leg -> words for it, the clearest first
+LEG = {  # joint of a leg -> words that name it, the clearest first
     "hip": ("thigh", "upleg", "upperleg", "femur", "uplegs", "hip"),
     "knee": ("knee", "shin", "calf", "lowerleg", "lowleg", "loleg", "tibia", "leg"),
     "ankle": ("ankle", "foot"),
@@ -42,20 +43,20 @@ TOKENS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 GLUED = re.compile(r"(left|right|l|r)(.+)")  # leftupleg, lfemur
 
 
-class NodeWords(NamedTuple):
-    """The parts of a node's name: `left`, `right` or nothing, and the rest in small letters."""
+class NodeName(NamedTuple):
+    """The parts of a node's name: the side (`left`, `right` or empty), and the rest in lower case."""
 
     side: str
     word: str
 
 
 @dataclass(frozen=True)
-class Guess:
+class MapGuess:
     """A proposed map.
 
     Attributes:
         skeleton: the map.
-        by_tree: the joints that were found by the tree, without their names.
+        by_tree: the joints that were found by the tree instead of by names.
     """
 
     skeleton: SkeletonMap
@@ -63,14 +64,14 @@ class Guess:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """The joints that a map must have and that were not found."""
+        """The required joints that were not found."""
         return tuple(joint for joint in REQUIRED if joint not in self.skeleton.joints)
 
 
-def split_words(name: str) -> NodeWords:
-    """Return the side and the word of a name without namespace.
+def split_node_name(name: str) -> NodeName:
+    """Split a node's name without namespace into side and word.
 
-    The side letter of a name like `lfemur` is split off only if the rest is a known word.
+    The side letter in names like `lfemur` is split off only if the rest is a known word.
 
     Args:
         name: such as `LeftUpLeg`, `lShldr`, `UpperArm_L`, `thigh.r`, `lfemur`.
@@ -78,82 +79,86 @@ def split_words(name: str) -> NodeWords:
     tokens = [token.lower() for token in TOKENS.findall(name.removesuffix(END))]
     sides = {SIDES[token] for token in tokens if token in SIDES}
     if len(sides) == 1:
-        return NodeWords(sides.pop(), "".join(token for token in tokens if token not in SIDES))
+        return NodeName(sides.pop(), "".join(token for token in tokens if token not in SIDES))
     word = "".join(tokens)
     glued = GLUED.fullmatch(word)
     if glued and glued[2] in KNOWN:
-        return NodeWords(SIDES[glued[1]], glued[2])
-    return NodeWords("", word)
+        return NodeName(SIDES[glued[1]], glued[2])
+    return NodeName("", word)
 
 
-def guess(recording: Recording, name: str) -> Guess:
-    """Propose a map with the given name for a file."""
+def guess_map(recording: Recording, name: str) -> MapGuess:
+    """Propose a map for a file.
+
+    Args:
+        recording: the file.
+        name: name of the map."""
     tree = _Tree(recording)
     node_of: dict[str, int] = {}
     for side in ("left", "right"):
-        leg, arm = tree.limb(side, LEG), tree.limb(side, ARM)
+        leg, arm = tree.find_limb(side, LEG), tree.find_limb(side, ARM)
         node_of |= {f"{side}_{part}": node for part, node in (leg | arm).items()}
         if "shoulder" in arm:
-            above = tree.line(arm["shoulder"])[:-1]
+            above = tree.list_path(arm["shoulder"])[:-1]
             collars = [n for n in above if tree.words[n].word in COLLAR and tree.words[n].side == side]
             node_of |= {f"{side}_collar": collars[-1]} if collars else {}
     by_name = set(node_of)
-    node_of |= tree.trunk(node_of)
+    node_of |= tree.find_trunk(node_of)
     by_name |= {
         joint for joint in ("neck", "head") if joint in node_of and joint in tree.words[node_of[joint]].word
     }
     for side in ("left", "right"):
         ankle = node_of.get(f"{side}_ankle")
-        tips = [] if ankle is None or f"{side}_foot" in node_of else tree.children(ankle)
+        tips = [] if ankle is None or f"{side}_foot" in node_of else tree.list_children(ankle)
         node_of |= {f"{side}_foot": tips[0]} if len(tips) == 1 else {}
     joints = {joint: recording.nodes[node_of[joint]] for joint in JOINTS if joint in node_of}
-    skeleton = SkeletonMap(name, joints, calibration_frame=first_step(recording) > JUMP)
-    return Guess(skeleton, tuple(joint for joint in joints if joint not in by_name))
+    skeleton = SkeletonMap(name, joints, calibration_frame=measure_first_step(recording) > JUMP)
+    return MapGuess(skeleton, tuple(joint for joint in joints if joint not in by_name))
 
 
 class _Tree:
-    """The nodes of a recording, with the words of their names."""
+    """The nodes of a recording, and the parts of their names."""
 
     def __init__(self, recording: Recording) -> None:
         self.parents, self.nodes = recording.node_parents, recording.nodes
-        self.words = [split_words(name) for name in without_namespace(recording.nodes)]
+        self.words = [split_node_name(name) for name in strip_namespace(recording.nodes)]
 
-    def line(self, node: int) -> list[int]:
-        """Return the nodes from the root to a node."""
+    def list_path(self, node: int) -> list[int]:
+        """Return the path from the root to a node."""
         line = [node]
         while self.parents[line[0]] >= 0:
             line.insert(0, self.parents[line[0]])
         return line
 
-    def children(self, node: int) -> list[int]:
+    def list_children(self, node: int) -> list[int]:
         return [child for child, parent in enumerate(self.parents) if parent == node]
 
     def is_end(self, node: int) -> bool:
         return self.nodes[node].endswith(END)
 
-    def limb(self, side: str, parts: dict[str, tuple[str, ...]]) -> dict[str, int]:
-        """Return the joints of a limb that names identify, each below the one before it."""
+    def find_limb(self, side: str, parts: dict[str, tuple[str, ...]]) -> dict[str, int]:
+        """Find the joints of a limb by the names of nodes. Each joint is below the previous one."""
         node_of: dict[str, int] = {}
         for part, spellings in parts.items():
             above = next(reversed(node_of.values()), None)
             below = [
                 node
                 for node in range(len(self.nodes))
-                if not self.is_end(node) and (above is None or above in self.line(node)[:-1])
+                if not self.is_end(node) and (above is None or above in self.list_path(node)[:-1])
             ]
             matches = [n for word in spellings for n in below if self.words[n] == (side, word)]
             if matches:
                 node_of[part] = matches[0]
         return node_of
 
-    def trunk(self, limbs: dict[str, int]) -> dict[str, int]:
-        """Return pelvis, spine, neck and head, given the joints of the limbs."""
+    def find_trunk(self, limbs: dict[str, int]) -> dict[str, int]:
+        """Find pelvis, spine, neck and head, given the joints of the limbs."""
         ends = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
         if not set(ends) <= set(limbs):
             return {}
-        lines = [self.line(limbs[joint]) for joint in ends]
+        lines = [self.list_path(limbs[joint]) for joint in ends]
         hips, shoulders = ([n for n in left if n in right] for left, right in (lines[:2], lines[2:]))
-        shared = [node for node in hips if node in shoulders]  # down to where legs and arms part
+        shared = [node for node in hips if node in shoulders]  # up to the last common node of legs and arms
         spine = shoulders[len(shared) :]
         node_of = {"pelvis": shared[-1]}
         if spine:
@@ -161,10 +166,10 @@ class _Tree:
             node_of |= {f"spine{step}": spine[index] for step, index in enumerate(indices, start=1)}
         heads = [n for n, words in enumerate(self.words) if words.word == "head" and not self.is_end(n)]
         if heads:
-            line = self.line(heads[0])
-        else:  # the longest line of nodes above the shoulders that is not an arm
+            line = self.list_path(heads[0])
+        else:  # the longest path through the last shoulder node, without arms
             arms = {node for arm in lines[2:] for node in arm} - set(shoulders)
-            lines_to_all = [self.line(n) for n in range(len(self.nodes))]
+            lines_to_all = [self.list_path(n) for n in range(len(self.nodes))]
             line = max((x for x in lines_to_all if shoulders[-1] in x and not arms & set(x)), key=len)
         above = [node for node in line if node not in shoulders and not self.is_end(node)]
         if above:
@@ -173,21 +178,21 @@ class _Tree:
         return node_of
 
 
-def check(recording: Recording, proposed: Guess) -> Conversion:
+def convert_with_guess(recording: Recording, proposed: MapGuess) -> Conversion:
     """Convert a file to the built-in body with a proposed map.
 
     Raises:
-        InputError: if the file can't be imported with this map.
+        InputError: if the file can't be imported with the proposed map.
     """
     if missing := ", ".join(proposed.missing):
-        raise InputError(f"joints.{proposed.missing[0]}: not found; add {missing} by hand")
+        raise InputError(f"joints.{proposed.missing[0]}: not found; add {missing} to the map")
     name = proposed.skeleton.name
-    fps = recording.fps or 60.0  # no fault of the map follows from it
-    return convert(recording, proposed.skeleton, builtin_rest_joints(), name=name, fps=fps)
+    fps = recording.fps or 60.0  # the check of the map does not depend on the rate
+    return convert_recording(recording, proposed.skeleton, make_builtin_rest_joints(), name=name, fps=fps)
 
 
-def as_yaml(proposed: Guess, recording: Recording) -> str:
-    """Return the map as YAML, with comments that mark guesses and missing joints."""
+def format_yaml(proposed: MapGuess, recording: Recording) -> str:
+    """Format the map as YAML, with comments that mark guesses and missing joints."""
     skeleton = proposed.skeleton
     lines = [
         f"# Proposed for {recording.path.name} by `memmlp data skeleton guess`.",
@@ -210,11 +215,11 @@ def as_yaml(proposed: Guess, recording: Recording) -> str:
 
 
 def write_map(path: Path, text: str) -> None:
-    """Write a map to a new file. Raises InputError if the file exists, or can't be written."""
+    """Write a map to a new file. Raises InputError if the file exists or can't be written."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise InputError(f"--out {path}: exists already; must be a new file") from None
+        raise InputError(f"--out {path}: file exists; must be a new file") from None
     except OSError as error:
         raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None

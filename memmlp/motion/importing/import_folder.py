@@ -1,4 +1,4 @@
-"""Imports a folder of recordings as AMASS npz, with a record of the sources, or verifies such an import."""
+"""Imports a folder of recordings as AMASS npz files with a record, or checks it by a trial import."""
 
 from __future__ import annotations
 
@@ -15,14 +15,27 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
-from memmlp.motion.body import RECORD, body_record, load_rest_joints
-from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
+from memmlp.motion.body import RECORD, describe_body, load_rest_joints
+from memmlp.motion.clip import FRAME_RATE_RANGE, SkippedFile
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.formats.recording import Recording
-from memmlp.motion.geometry import one_thread
-from memmlp.motion.importing.convert import AUTO, JUMP, STRAIGHTEST, Conversion, convert, first_step
+from memmlp.motion.geometry import limit_to_one_thread
+from memmlp.motion.importing.convert import (
+    AUTO,
+    JUMP,
+    STRAIGHTEST,
+    Conversion,
+    convert_recording,
+    measure_first_step,
+)
 from memmlp.motion.importing.fidelity import Fidelity
-from memmlp.motion.importing.recordings import Rate, find_rate, find_recordings, folder_key, read_recording
+from memmlp.motion.importing.recordings import (
+    Rate,
+    find_rate,
+    find_recordings,
+    make_folder_key,
+    read_recording,
+)
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
 
 
@@ -32,22 +45,21 @@ class ImportedClip:
 
     Attributes:
         source: the file's path below its folder.
-        sha256: digest of that file.
-        clip: the npz file's path below its folder.
+        sha256: SHA-256 of the source file.
+        clip: the npz file's path below the output folder.
         skeleton: name of the skeleton map.
         unit: the file's unit, metres.
         up: the file's up axis, `y` or `z`.
-        stance: a description of the pose that shows the skeleton.
+        stance: a description of the stance.
         frames: number of frames.
-        header_fps: frame rate in the file's header, Hz; None without a rate.
+        header_fps: frame rate in the file's header, Hz; None if the header has no rate.
         fps: frame rate of the clip, Hz.
         fps_reason: a description of the rate's origin.
-        floor: height of the floor that was subtracted, metres at the body's size; None if none was found or
-            asked for.
-        scale: the body's size, as a multiple of the file's.
-        first_step: the distance of frame 0 from frame 1, in multiples of other frames' steps
-            (`convert.first_step`); 0 where the map leaves frame 0 of the file out.
-        faults: the clip's faults, one sentence each (`fidelity.compare`).
+        floor: the subtracted height of the floor, metres at the body's scale; None if nothing was subtracted.
+        scale: the body's size divided by the size in the file.
+        first_step: the step from frame 0 to frame 1, relative to later steps (`convert.measure_first_step`);
+            0 if the map excludes frame 0.
+        faults: the clip's likely mistakes, one sentence each (`fidelity.Fidelity`).
     """
 
     source: str
@@ -69,17 +81,17 @@ class ImportedClip:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """The result of an import.
+    """The report of an import.
 
     Attributes:
         clips: the clips that were written.
-        notes: remarks on the clips for the user, such as corrected frame rates.
+        notes: notes for the user, such as corrected frame rates.
         skipped: the files that were skipped.
     """
 
     clips: tuple[ImportedClip, ...]
     notes: tuple[str, ...]
-    skipped: tuple[Skipped, ...]
+    skipped: tuple[SkippedFile, ...]
 
 
 @dataclass(frozen=True)
@@ -87,15 +99,14 @@ class ImportSettings:
     """The settings of an import.
 
     Attributes:
-        skeleton: the name of a shipped map, or the path of a map; None lets each file's joints decide.
-        fps: true frame rates, Hz, by folder below the source ("" for all); they override known rates of
-            files, and headers.
+        skeleton: the name of a shipped map, or the path of a map; None chooses by the joints of each file.
+        fps: folder below the source ("" for all) -> true frame rate, Hz. It overrides all other rates.
         body: `builtin`, or an SMPL-H model.npz.
-        floor: `auto`: the lowest stable contact of the feet is at 0; `none`: left as the file has it; or the
-            floor's height in the files, metres.
-        strict: whether a bad file raises; otherwise it is skipped and reported.
-        sound: whether to skip clips with faults; otherwise they are written and their faults are reported.
-        up: the files' up axis, `y` or `z`; None leaves it to the map.
+        floor: `auto`: find the floor from the feet; `none`: keep all heights; or the floor's height in the
+            files, metres.
+        strict: whether a bad file raises an error; otherwise it is skipped and reported.
+        sound: whether to skip clips with likely mistakes; otherwise these clips are written and reported.
+        up: the files' up axis, `y` or `z`; None uses the map's.
     """
 
     skeleton: str | None = None
@@ -108,28 +119,29 @@ class ImportSettings:
 
 
 def import_folder(source: Path, out: Path, settings: ImportSettings | None = None) -> ImportReport:
-    """Write each file of a folder, or a single file, as out/<its path>.npz, and a record as out/import.json.
+    """Import each file of a folder, or a single file, as OUT/RELATIVE_PATH.npz, and write OUT/import.json.
 
     Args:
         source: folder or file.
-        out: folder; it must not hold other clips than this import's.
+        out: output folder, without clips of other imports.
         settings: the settings.
 
     Raises:
-        InputError: if there are no files or several of one name, a rate is for no folder, `out` has clips of
-            another import or cannot be written, or no file can be imported. Nothing is written then.
+        InputError: if there are no files, several files have one name, a rate has an unknown folder, `out`
+            has clips of a different import or cannot be written, or no file can be imported. Then nothing is
+            written.
     """
     settings, files = settings or ImportSettings(), find_recordings(source)
     _check_import(files, out, settings)
     settings = replace(settings, strict=settings.strict or len(files) == 1)
-    rest, clips, skipped = load_rest_joints(settings.body), [], list[Skipped]()
+    rest, clips, skipped = load_rest_joints(settings.body), [], list[SkippedFile]()
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as staging:
             folder = Path(staging) / "clips"
             folder.mkdir()
             for relative, result in _convert_all(files, settings, rest):
-                if isinstance(result, Skipped):
+                if isinstance(result, SkippedFile):
                     skipped.append(result)
                     continue
                 write_clip(folder / relative.with_suffix(".npz"), result.converted.clip)
@@ -137,38 +149,38 @@ def import_folder(source: Path, out: Path, settings: ImportSettings | None = Non
             if not clips:
                 first = f"the first: {skipped[0].file}: {skipped[0].reason}"
                 raise InputError(f"{source}: no usable file of {len(files)}; {first}")
-            report = ImportReport(tuple(clips), tuple(_notes(clips, settings)), tuple(skipped))
-            _publish(folder, out, report, body_record(settings.body, rest))
+            report = ImportReport(tuple(clips), tuple(_write_notes(clips, settings)), tuple(skipped))
+            _publish(folder, out, report, describe_body(settings.body, rest))
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror})") from error
     return report
 
 
-def verify_folder(source: Path, settings: ImportSettings | None = None) -> Iterator[Fidelity | Skipped]:
-    """Import each file of a folder, or a single one, on trial, and compare the clip with the file.
+def verify_folder(source: Path, settings: ImportSettings | None = None) -> Iterator[Fidelity | SkippedFile]:
+    """Import each file of a folder, or a single file, without writing it, and compare clip and file.
 
     Args:
         source: folder or file.
         settings: the settings.
 
     Yields:
-        The comparison, or the reason why a file cannot be imported.
+        For each file the comparison, or the reason why the file cannot be imported.
 
     Raises:
-        InputError: if there is no file, or no such skeleton or body.
+        InputError: if there are no files, or the skeleton or body does not exist.
     """
     settings = settings or ImportSettings()
     rest = load_rest_joints(settings.body)
     for relative, result in _convert_all(find_recordings(source), settings, rest):
-        if isinstance(result, Skipped):
+        if isinstance(result, SkippedFile):
             yield result
         else:
             yield replace(result.converted.fidelity, name=relative.as_posix())
 
 
 @dataclass(frozen=True)
-class _Result:
-    """A file's recording, its map and rate, and the clip made of it."""
+class _ConvertedFile:
+    """A converted recording, with its map and its rate."""
 
     recording: Recording
     skeleton: SkeletonMap
@@ -178,47 +190,49 @@ class _Result:
 
 def _convert_all(
     files: Mapping[Path, Path], settings: ImportSettings, rest: np.ndarray
-) -> Iterator[tuple[Path, _Result | Skipped]]:
-    """Yield each file's path below the folder with the clip made of it, or with why it is skipped."""
+) -> Iterator[tuple[Path, _ConvertedFile | SkippedFile]]:
+    """Yield each file's path below the folder, and its conversion or the reason to skip it."""
     user_map = None if settings.skeleton is None else load_skeleton(settings.skeleton)
     for relative, path in progress_bar(files.items(), "import", len(files)):
         try:
             recording = read_recording(path)
-            skeleton = find_skeleton(recording, user_map).with_up(settings.up)
+            skeleton = find_skeleton(recording, user_map).replace_up_axis(settings.up)
             rate, name = find_rate(recording, relative, settings.fps), relative.with_suffix("").as_posix()
-            with one_thread():
-                converted = convert(recording, skeleton, rest, name=name, fps=rate.fps, floor=settings.floor)
+            with limit_to_one_thread():
+                converted = convert_recording(
+                    recording, skeleton, rest, name=name, fps=rate.fps, floor=settings.floor
+                )
             if settings.sound and converted.fidelity.faults:
                 faults = "; ".join(converted.fidelity.faults)
-                raise InputError(f"{path}: {faults}; --sound expects clips without faults")
+                raise InputError(f"{path}: {faults}; --sound accepts only clips without likely mistakes")
         except InputError as error:
             if settings.strict:
                 raise
-            yield relative, Skipped(relative.as_posix(), str(error).replace(f"{path}: ", ""))
+            yield relative, SkippedFile(relative.as_posix(), str(error).replace(f"{path}: ", ""))
         else:
-            yield relative, _Result(recording, skeleton, rate, converted)
+            yield relative, _ConvertedFile(recording, skeleton, rate, converted)
 
 
 def _check_import(files: Mapping[Path, Path], out: Path, settings: ImportSettings) -> None:
-    """Raise InputError for two sources of one clip, foreign clips in `out`, or wrong rates."""
+    """Raise InputError for several sources of a clip, foreign clips in `out`, or invalid rates."""
     npz, count = Counter(relative.with_suffix(".npz") for relative in files).most_common(1)[0]
     if count > 1:
-        raise InputError(f"{npz.with_suffix('').as_posix()}: {count} recordings of this name; expected one")
+        raise InputError(f"{npz.with_suffix('').as_posix()}: {count} recordings have this name; expected one")
     expected = {path.with_suffix(".npz") for path in files}
     foreign = sorted({path.relative_to(out) for path in out.rglob("*.npz")} - expected)
     if foreign or (out.exists() and not out.is_dir()):
         problem = f"has other clips, such as {foreign[0].as_posix()}" if foreign else "is a file"
-        raise InputError(f"{out}: {problem}; must be a new folder, or that of the same import")
-    folders = sorted({folder_key(folder) for relative in files for folder in relative.parents})
+        raise InputError(f"{out}: {problem}; must be a new folder, or the folder of the same import")
+    folders = sorted({make_folder_key(folder) for relative in files for folder in relative.parents})
     for folder, rate in settings.fps.items():
         if folder not in folders or not is_number(rate, *FRAME_RATE_RANGE):
             choices = ", ".join(map(repr, folders))
             raise InputError(
-                f"--fps {folder}={rate!r}: must be 1 to 1000 Hz for one of {choices} ('' is all)"
+                f"--fps {folder}={rate!r}: must be 1 to 1000 Hz for a folder of {choices} ('' means all)"
             )
 
 
-def _describe_clip(relative: Path, result: _Result) -> ImportedClip:
+def _describe_clip(relative: Path, result: _ConvertedFile) -> ImportedClip:
     converted, recording = result.converted, result.recording
     return ImportedClip(
         source=relative.as_posix(),
@@ -234,16 +248,16 @@ def _describe_clip(relative: Path, result: _Result) -> ImportedClip:
         fps_reason=result.rate.reason,
         floor=converted.floor,
         scale=converted.fitted.scale,
-        first_step=0.0 if result.skeleton.calibration_frame else first_step(recording),
+        first_step=0.0 if result.skeleton.calibration_frame else measure_first_step(recording),
         faults=converted.fidelity.faults,
     )
 
 
 def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, str]) -> None:
-    """Move clips and record from staging to `out`, and remove earlier clips of the files skipped now.
+    """Move clips and record from the staging folder to `out`. Old clips of skipped files are removed.
 
-    A new folder `out` appears with all files at once. In the folder of an earlier import, the old record is
-    removed first and the new one is written last. A folder without a record may hold clips of two imports.
+    A new folder `out` appears complete. In the folder of an earlier import, the old record is removed first,
+    and the new record is written last. So a folder without a record may have clips of two imports.
     """
     record = {**body, **asdict(report)}
     (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
@@ -258,39 +272,39 @@ def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, 
         (out / Path(skipped.file).with_suffix(".npz")).unlink(missing_ok=True)
 
 
-def _notes(clips: Sequence[ImportedClip], settings: ImportSettings) -> Iterator[str]:
+def _write_notes(clips: Sequence[ImportedClip], settings: ImportSettings) -> Iterator[str]:
     """Yield notes for the user, one line each."""
     corrected: dict[str, list[str]] = {}
     for clip in clips:
         if clip.header_fps not in (None, clip.fps):
-            rates = f"{clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"
+            rates = f"{clip.fps:g} Hz, {clip.fps_reason}; the header has {clip.header_fps:g} Hz"
             folder = Path(clip.source).parent.as_posix()
             corrected.setdefault(f"{folder}: {rates}", []).append(Path(clip.source).name)
     for correction, names in corrected.items():
-        yield f"{correction} ({_name_first(names, 3)})"
+        yield f"{correction} ({_format_names(names, 3)})"
     for name in sorted({clip.skeleton for clip in clips}):
         clips_of_map = [clip for clip in clips if clip.skeleton == name]
         for key in ("up", "unit"):
             counts = Counter(getattr(clip, key) for clip in clips_of_map)
             if len(counts) > 1:
                 several = ", ".join(f"{value} in {count} clips" for value, count in counts.most_common())
-                yield f"{name}: {key} is found as {several}; set it in the map if that is wrong"
+                yield f"{name}: {key} differs between clips: {several}; if this is wrong, set it in the map"
         count = sum(clip.stance.startswith(STRAIGHTEST) for clip in clips_of_map)
         if count > 1:
             yield (
-                f"{name}: the zero pose of {count} clips is not a stance, so each is read from its own "
-                "frame, and head, hands and feet may be turned differently; a rest in the map avoids that"
+                f"{name}: the zero pose of {count} clips is not a stance, so each clip uses a frame, "
+                "and head, hands and feet may be rotated differently; add rest to the map to avoid this"
             )
     if jumping := [clip.source for clip in clips if clip.first_step > JUMP]:
         yield (
-            f"{_name_first(jumping, 1)}: frame 0 is far from frame 1, as a T-pose is before the motion; "
-            "calibration_frame: true in a custom map leaves it out"
+            f"{_format_names(jumping, 1)}: frame 0 is far from frame 1, so it may be a T-pose; "
+            "exclude frame 0 with calibration_frame: true in a custom map"
         )
     floorless = [clip.source for clip in clips if clip.floor is None]
     if settings.floor == AUTO and floorless:
-        yield f"{_name_first(floorless, 1)}: no foot stands still, so the floor is as in the file"
+        yield f"{_format_names(floorless, 1)}: no foot stands still, so the floor height was not corrected"
 
 
-def _name_first(names: Sequence[str], count: int) -> str:
-    """Return the first names, and how many more there are."""
+def _format_names(names: Sequence[str], count: int) -> str:
+    """List the first names, and count the others."""
     return ", ".join(names[:count]) + (f" and {len(names) - count} more" if len(names) > count else "")

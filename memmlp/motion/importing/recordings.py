@@ -1,7 +1,7 @@
 """Finds and reads recordings, and finds their true frame rates.
 
-`READERS` has the formats, by suffix. A further format is one module in `memmlp.motion.formats` with a
-function `read(path) -> Recording`, and its entry here.
+To add a format, write a module in `memmlp.motion.formats` with a function `read(path) -> Recording`, and add
+the function to `READERS`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.recording import Recording
 
 READERS: dict[str, Callable[[Path], Recording]] = {".bvh": read_bvh, ".amc": read_amc}
-EXPECTED = f"expected a {' or '.join(READERS)} file, or a folder with some in it"
+EXPECTED = f"expected a {' or '.join(READERS)} file, or a folder with such files"
 HEADER = "the header's"
-DIGITS = 16  # of a file's digest, by which its true rate is known
+DIGITS = 16  # number of digits of a file's digest in known_rates.yaml
 
 
 class Rate(NamedTuple):
@@ -30,21 +30,24 @@ class Rate(NamedTuple):
 
     Attributes:
         fps: frames per second.
-        reason: a description of the rate's origin.
+        reason: where the rate comes from, for messages.
     """
 
     fps: float
     reason: str
 
 
-DATABASES = Rate(120.0, "of CMU and HDM05, as AMC files do not state a rate")
+DATABASES = Rate(120.0, "the rate of CMU and HDM05, because AMC files do not have a rate")
 
 
 def find_recordings(source: Path) -> dict[Path, Path]:
-    """Find the recordings of a folder, or a single one: sorted, by their path below the folder.
+    """Find the recordings of a folder, or a single recording.
+
+    Returns:
+        Path below the folder -> path, sorted.
 
     Raises:
-        InputError: if it is missing, or has none.
+        InputError: if the folder or file is missing, or the folder has no recordings.
     """
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; {EXPECTED}")
@@ -57,34 +60,34 @@ def find_recordings(source: Path) -> dict[Path, Path]:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a recording. Raises InputError if the file is damaged, or of another format."""
+    """Read a recording. Raises InputError if the file is damaged or has an unknown format."""
     if path.suffix.lower() not in READERS:
         raise InputError(f"{path}: {EXPECTED}")
     return READERS[path.suffix.lower()](path)
 
 
-def find_rate(recording: Recording, relative: Path, given: Mapping[str, float]) -> Rate:
-    """Return a recording's true frame rate: given by the user, known of the file, the header's, or 120 Hz.
+def find_rate(recording: Recording, relative: Path, user_rates: Mapping[str, float]) -> Rate:
+    """Find the true frame rate: the user's rate, else a known correction, else the header's, else 120 Hz.
 
     Args:
         recording: the recording.
         relative: the file's path below the imported folder.
-        given: rates by folder below that folder ("" for all).
+        user_rates: folder below the imported folder ("" for all) -> rate, Hz.
     """
     for folder in relative.parents:
-        if (key := folder_key(folder)) in given:
-            return Rate(float(given[key]), f"given for {key or 'all'}")
-    plain = recording.path.read_bytes().replace(b"\r\n", b"\n")  # whatever line ends a tool gave the file
+        if (key := make_folder_key(folder)) in user_rates:
+            return Rate(float(user_rates[key]), f"set for {key or 'all'}")
+    plain = recording.path.read_bytes().replace(b"\r\n", b"\n")  # ignore differences in line ends
     known = _load_known_rates().get(hashlib.sha256(plain).hexdigest()[:DIGITS])
     if known is not None:
-        return Rate(known, "known of this file")
+        return Rate(known, "the known true rate of this file")
     if recording.fps is None:
         return DATABASES
     return Rate(recording.fps, HEADER)
 
 
-def folder_key(folder: Path) -> str:
-    """Return the name of a folder below the imported one for `--fps`; "" for the imported folder itself."""
+def make_folder_key(folder: Path) -> str:
+    """Return a folder's name in `--fps`, relative to the imported folder; "" for the imported folder."""
     return "" if folder == Path() else folder.as_posix()
 
 

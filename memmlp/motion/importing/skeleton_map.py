@@ -1,4 +1,4 @@
-"""Skeleton maps, as YAML: they map the 22 body joints to nodes of a motion file, and pick their motion."""
+"""Skeleton maps: YAML files that map the 22 body joints to the nodes of motion files."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.formats.recording import END, Recording
 
 SKELETONS = Path(__file__).parent / "skeletons"
-Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from Y-up axes to the world: y becomes z
 UPRIGHT = {"y": np.eye(3), "z": Z_UP.T}  # up axis of a file -> rotation from its axes to Y-up axes
 REQUIRED = (
     "pelvis", "head", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle",
     "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
 )  # fmt: skip
-AUTO = "auto"  # a unit or up axis that is found in each file
+AUTO = "auto"  # the unit or up axis is found for each file
 SEPARATORS = re.compile(r"[\W_]+")
 
 
@@ -35,12 +35,12 @@ class SkeletonMap:
 
     Attributes:
         name: the map's name.
-        joints: body joint -> the file's node (a joint, or `<joint>.end`) that stands for it.
-        unit: the file's unit in metres, None if it is to be found from the legs.
-        up: the file's up axis, `y` or `z`, None if it is to be found from the motion.
-        calibration_frame: whether frame 0 is a calibration pose, not motion.
-        rest: a pose in which the person stands, as rotation values of joints in degrees, like in a frame of
-            the file. None means the zero pose if the person stands in it, else the straightest frame.
+        joints: body joint -> node in the file (a joint, or `<joint>.end`).
+        unit: the file's unit in metres; None finds it from the length of the legs.
+        up: the file's up axis, `y` or `z`; None finds it from the motion.
+        calibration_frame: whether frame 0 is a calibration pose instead of motion.
+        rest: a stance, as joint -> rotation values in degrees, like in a frame of the file. None uses the
+            zero pose if the person stands in it, else the straightest frame.
     """
 
     name: str
@@ -50,30 +50,30 @@ class SkeletonMap:
     calibration_frame: bool = False
     rest: dict[str, list[float]] | None = None
 
-    def with_up(self, up: str | None) -> SkeletonMap:
-        """Return the map with an up axis, `y` or `z`, that the user gave; None changes nothing."""
+    def replace_up_axis(self, up: str | None) -> SkeletonMap:
+        """Return a copy with a different up axis, `y` or `z`; None changes nothing."""
         return self if up is None else replace(self, up=up)
 
     @property
     def upright(self) -> np.ndarray:
-        """The rotation (3, 3) from the file's axes to Y-up axes. `up` must be set."""
+        """The rotation (3, 3) from the file's axes to Y-up axes; requires `up`."""
         return UPRIGHT[str(self.up)]
 
 
-def shipped_skeletons() -> tuple[str, ...]:
-    """Return the names of the maps in the package."""
+def list_shipped_skeletons() -> tuple[str, ...]:
+    """List the names of the maps in the package."""
     return tuple(sorted(path.stem for path in SKELETONS.glob("*.yaml")))
 
 
 def load_skeleton(which: str) -> SkeletonMap:
-    """Load a shipped map by its name, or a user's by its path.
+    """Load a shipped map, given its name, or the user's map, given its path.
 
     Raises:
-        InputError: if there is no such file or it is not a valid map.
+        InputError: if the map does not exist or is invalid.
     """
-    path = SKELETONS / f"{which}.yaml" if which in shipped_skeletons() else Path(which)
+    path = SKELETONS / f"{which}.yaml" if which in list_shipped_skeletons() else Path(which)
     if not path.is_file():
-        names = ", ".join(shipped_skeletons())
+        names = ", ".join(list_shipped_skeletons())
         raise InputError(f"--skeleton {which}: must be one of {names}, or the path of a YAML map")
     try:
         content = yaml.load(path.read_text("utf-8"), _StrictLoader)
@@ -81,18 +81,19 @@ def load_skeleton(which: str) -> SkeletonMap:
         raise InputError(
             f"{path}: {describe_read_error(error)[:120]}; expected a readable YAML map"
         ) from error
-    return _parse(path, content)
+    return _parse_map(path, content)
 
 
 def find_skeleton(recording: Recording, user_map: SkeletonMap | None = None) -> SkeletonMap:
-    """Find the shipped map that fits a file: the file has all of its nodes. The map with the most nodes wins.
+    """Find the skeleton map for a file, and adapt it to the file's spelling of nodes.
 
-    Of maps with equally many nodes, the one that finds unit and up axis in the file is preferred. Spellings
-    and namespaces may differ (`find_nodes`); the returned map has the file's spellings. A map that the user
-    chose is returned with the file's spellings, or unchanged if the file lacks some of its nodes.
+    A map fits if the file has all of its nodes. Spelling and namespaces may differ (`find_nodes`). Of several
+    maps that fit, the map with the largest number of nodes is chosen. If these numbers are equal, a map
+    without a fixed unit and up axis is preferred. The user's map is always chosen; it stays unchanged if it
+    does not fit.
 
     Raises:
-        InputError: if no map fits, or several fit equally well.
+        InputError: if no map fits, or several maps fit equally well.
     """
     if user_map is not None:
         return _respell(user_map, recording) or user_map
@@ -109,20 +110,21 @@ def find_skeleton(recording: Recording, user_map: SkeletonMap | None = None) -> 
     problem = "fits more than one skeleton" if fitting else "has an unknown skeleton"
     names = ", ".join(skeleton.name for skeleton in fitting or maps)
     joint_names = [name for name in recording.nodes if not name.endswith(END)]
-    listed = ", ".join(joint_names[:60]) + (", ..." if len(joint_names) > 60 else "")
+    joint_list = ", ".join(joint_names[:60]) + (", ..." if len(joint_names) > 60 else "")
     raise InputError(
-        f"{recording.path}: {problem} with the joints {listed}; expected {names}, or a map by --skeleton"
+        f"{recording.path}: {problem} with the joints {joint_list}; "
+        f"expected one of {names}, or a map in --skeleton"
     )
 
 
 @cache
 def _load_shipped(folder: Path) -> tuple[SkeletonMap, ...]:
-    """Load the maps of the package's folder once: reading YAML takes longer than importing a short clip."""
+    """Load the package's maps once, because reading YAML is slower than the import of a short clip."""
     return tuple(load_skeleton(path.stem) for path in sorted(folder.glob("*.yaml")))
 
 
 def _respell(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
-    """Return a map with its nodes spelt as in the file; None if the file lacks one of them."""
+    """Adapt a map to the file's spelling of nodes; None if the file lacks a node."""
     rest = skeleton.rest or {}
     nodes = find_nodes(recording.nodes, sorted({*skeleton.joints.values(), *rest}))
     if nodes is None:
@@ -134,16 +136,15 @@ def _respell(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
 # Names of nodes
 
 
-def without_namespace(nodes: Sequence[str]) -> list[str]:
-    """Return the names without their common beginning, such as `mixamorig:`, `Character1_` or `m_avg_`.
+def strip_namespace(nodes: Sequence[str]) -> list[str]:
+    """Remove common prefixes of node names, such as `mixamorig:`, `Character1_` or `m_avg_`.
 
-    Anything that ends in a colon is a namespace, common or not. The names are left whole if two would become
-    the same.
+    A prefix with a colon is always removed. If the resulting names are not unique, the names stay unchanged.
     """
     plain = [re.sub(r".*[:|]", "", node) for node in nodes]
     letters = zip(*(name.removesuffix(END) for name in plain), strict=False)
     shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, letters)]
-    for length in range(len(shared), 0, -1):  # up to a separator or before a capital letter
+    for length in range(len(shared), 0, -1):  # prefixes end at a separator or before a capital letter
         capital = shared[length - 1].islower() and all(name[length : length + 1].isupper() for name in plain)
         if SEPARATORS.fullmatch(shared[length - 1]) or capital:
             plain = [name[length:] for name in plain]
@@ -152,20 +153,20 @@ def without_namespace(nodes: Sequence[str]) -> list[str]:
 
 
 def find_nodes(nodes: Sequence[str], names: Sequence[str]) -> dict[str, str] | None:
-    """Find the file's node for each name: the exact name, else the only node with an equivalent spelling.
+    """Find the node for each name: the equal node, or else the only node with an equivalent spelling.
 
-    `Left_hip`, `left_hip` and `x:LeftHip` are equivalent. Returns None if a name has no node.
+    `Left_hip`, `left_hip` and `x:LeftHip` are equivalent. The result is None if a name has no node.
     """
-    keys = [_key(name) for name in without_namespace(nodes)]
+    keys = [_normalize_name(name) for name in strip_namespace(nodes)]
     count = Counter(keys)
     unique = {key: node for key, node in zip(keys, nodes, strict=True) if count[key] == 1}
-    node_of = {name: name if name in nodes else unique.get(_key(name)) for name in names}
+    node_of = {name: name if name in nodes else unique.get(_normalize_name(name)) for name in names}
     if None in node_of.values() or len(set(node_of.values())) < len(node_of):
         return None
     return {name: str(node) for name, node in node_of.items()}
 
 
-def _key(name: str) -> str:
+def _normalize_name(name: str) -> str:
     stem = name.removesuffix(END)
     return SEPARATORS.sub("", stem).lower() + (END if stem != name else "")
 
@@ -174,7 +175,7 @@ def _key(name: str) -> str:
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """A YAML loader that raises ValueError for a key that occurs twice."""
+    """A YAML loader that raises ValueError for repeated keys."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
@@ -183,16 +184,18 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _parse(path: Path, content: object) -> SkeletonMap:
-    """Return the map in a YAML file. Raises InputError unless all of its values are valid."""
+def _parse_map(path: Path, content: object) -> SkeletonMap:
+    """Parse the content of a YAML map. Raises InputError for invalid values."""
 
     def require(good: bool, key: str, expected: str) -> None:
         if not good:
-            raise InputError(f"{path}: {key}: must be {expected}")
+            raise InputError(f"{path}: {key} must be {expected}")
 
     required, optional = ("name", "joints"), ("unit", "up", "calibration_frame", "rest")
     if not isinstance(content, dict) or not set(required) <= set(content) <= {*required, *optional}:
-        raise InputError(f"{path}: the keys must be {', '.join(required)}, and any of {', '.join(optional)}")
+        raise InputError(
+            f"{path}: the keys must be {', '.join(required)}; optional keys are {', '.join(optional)}"
+        )
     values: dict[str, Any] = {key: None if value == AUTO else value for key, value in content.items()}
     require(_is_text(values["name"]), "name", "text")
     unit, joints = values.get("unit"), values["joints"] or {}
@@ -204,12 +207,12 @@ def _parse(path: Path, content: object) -> SkeletonMap:
     require(_is_rest(values.get("rest")), "rest", "auto, or JOINT: [degrees, degrees, degrees]")
     require(isinstance(joints, dict), "joints", f"a mapping of {', '.join(JOINTS)} to the file's joints")
     for joint, node in joints.items():
-        known = joint in JOINTS and _is_text(node)
-        require(known, f"joints.{joint}", f"a joint of the file for one of {', '.join(JOINTS)}")
+        is_valid = joint in JOINTS and _is_text(node)
+        require(is_valid, f"joints.{joint}", f"a joint of the file for one of {', '.join(JOINTS)}")
     for joint in REQUIRED:
-        require(joint in joints, f"joints.{joint}", "the name of a joint; it is required")
+        require(joint in joints, f"joints.{joint}", "the name of a joint (required)")
     node, count = Counter(joints.values()).most_common(1)[0]
-    require(count == 1, f"joints: {node}", "named once")
+    require(count == 1, f"{node} in joints", "unique")
     return SkeletonMap(**values)
 
 
@@ -229,11 +232,11 @@ def _is_text(value: object) -> bool:
 
 
 def is_number(value: object, low: float, high: float) -> bool:
-    """Return whether a value of a YAML file is a number between two bounds."""
+    """Return whether a YAML value is a number within two bounds."""
     return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
 
 
-# The joints' motion
+# Motion of the mapped joints
 
 
 @dataclass(frozen=True)
@@ -242,11 +245,11 @@ class MappedMotion:
 
     Attributes:
         path: the file, for messages.
-        mapped: whether (22,) each body joint has a node in the file.
-        nodes: index (22,) of that node; without one, the index of the parent joint's node.
-        rotations: global rotations (N, 22, 3, 3) of these nodes.
-        positions: their positions (N, 22, 3).
-        zero: their positions (22, 3) in the file's zero pose, where all rotations are the identity.
+        mapped: whether each body joint has a node in the file (22,).
+        nodes: index of each body joint's node (22,); the parent joint's node for unmapped joints.
+        rotations: global rotations of the nodes (N, 22, 3, 3).
+        positions: positions of the nodes (N, 22, 3).
+        zero: positions of the nodes in the zero pose (22, 3), where all rotations are the identity.
     """
 
     path: Path
@@ -261,14 +264,16 @@ class MappedMotion:
 
 
 def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
-    """Pick the mapped joints' motion from a recording, without its calibration frame.
+    """Select the motion of the mapped joints in a recording, without a calibration frame.
 
     Raises:
-        InputError: if nodes that the map names are missing or have another order than the body's, or no frame
-            is left.
+        InputError: if nodes of the map are missing, the order of nodes differs from the body's, or no frame
+            remains.
     """
     if missing := sorted(set(skeleton.joints.values()) - set(recording.nodes)):
-        raise InputError(f"{recording.path}: lacks {', '.join(missing)} of skeleton {skeleton.name}")
+        raise InputError(
+            f"{recording.path}: has no {', '.join(missing)}; required by skeleton {skeleton.name}"
+        )
     nodes = np.zeros(len(JOINTS), int)
     for joint, parent in enumerate(PARENTS):
         node = skeleton.joints.get(JOINTS[joint])
@@ -282,10 +287,10 @@ def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
                 f"{skeleton.name}; check the map"
             )
     rotations, positions = (
-        array[int(skeleton.calibration_frame) :, nodes] for array in recording.kinematics()
+        array[int(skeleton.calibration_frame) :, nodes] for array in recording.compute_kinematics()
     )
     if len(rotations) == 0:
-        raise InputError(f"{recording.path}: only the calibration frame; expected two frames or more")
+        raise InputError(f"{recording.path}: has only the calibration frame; must have two frames or more")
     upright, unit = skeleton.upright, skeleton.unit
     return MappedMotion(
         path=recording.path,
@@ -293,5 +298,5 @@ def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
         nodes=nodes,
         rotations=upright @ rotations @ upright.T,
         positions=unit * positions @ upright.T,
-        zero=unit * recording.zero_pose()[nodes] @ upright.T,
+        zero=unit * recording.compute_zero_pose()[nodes] @ upright.T,
     )

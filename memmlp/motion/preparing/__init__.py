@@ -1,1 +1,1 @@
-"""Turns a folder of clips into a split, memory-mappable cache."""
+"""Prepares a folder of clips: splits the clips, and writes a memory-mappable cache."""

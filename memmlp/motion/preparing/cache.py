@@ -1,8 +1,8 @@
-"""Turns a folder of AMASS npz into a memory-mappable cache of 60 Hz frames with a manifest.
+"""Converts a folder of AMASS npz files to a memory-mappable cache of 60 Hz frames with a manifest.
 
-The sources are read twice, one clip at a time. The first reading finds the sound clips and their lengths, so
-that the split divides sound clips only and every array's size is known. The second writes the frames. The
-manifest is written last: a cache without one is unfinished, and the next call makes it again.
+The files are read twice, one clip at a time. The first pass finds the valid clips and their lengths, which
+the split and the array sizes depend on. The second pass writes the frames. The manifest is written last: a
+cache without a manifest is unfinished, and the next call prepares it again.
 """
 
 from __future__ import annotations
@@ -22,29 +22,30 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock, check_owner, publish, temporary_path
 from memmlp.common.progress import progress_bar
-from memmlp.motion.body import FRAME_DIM, body_name, check_imported_body, load_rest_joints
+from memmlp.motion.body import FRAME_DIM, check_imported_body, format_body_name, load_rest_joints
 from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.preparing.find_clips import Folders, Root, find_clips
+from memmlp.motion.preparing.find_clips import NamedFolders, Root, find_clips
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, PARTS, ClipRecord, Manifest
 from memmlp.motion.preparing.splits import Split
 from memmlp.runs.identity import VERSIONS
 
-FRAMES_VERSION = 1  # number of a frame's content; a new one changes every digest, and so repeats every run
-CHUNK = 4096  # frames turned into features at a time
+FRAMES_VERSION = 1  # version of the frames' content; a new version changes all digests and repeats all runs
+CHUNK = 4096  # maximum number of frames that are converted at a time
 
 
 @dataclass(frozen=True)
 class ClipFolder:
-    """The source of a cache: the clips below a folder or several, and the settings.
+    """The source of a cache: one or more folders of clips, and the settings.
 
     Attributes:
-        root: folder of npz files, at any depth, or several of them by name.
-        split: assigns clips to train, val, test.
+        root: folder with npz files at any depth, or several named folders.
+        split: the split into train, val and test.
         body: "builtin" or the path of an SMPL-H model.npz.
-        min_frames: clips with fewer frames at 60 Hz are skipped (42 leave T = 41 frames of input).
-        strict: whether the first file that would be skipped raises InputError instead.
-        interpolation: how clips of other rates are brought to 60 Hz: one of `INTERPOLATIONS`.
+        min_frames: minimum number of frames at 60 Hz; shorter clips are skipped. 42 frames give T = 41
+            inputs.
+        strict: whether a bad file raises InputError; otherwise it is skipped.
+        interpolation: method of resampling to 60 Hz, one of `INTERPOLATIONS`.
     """
 
     root: Root
@@ -55,17 +56,17 @@ class ClipFolder:
     interpolation: str = SPLINES
 
 
-def prepare(source: ClipFolder, out: Path) -> Manifest:
-    """Make the cache in `out`, unless it is there already; concurrent callers wait for one another.
+def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
+    """Prepare the cache in the folder `out`, unless it is current. Only one process does so at a time.
 
     Raises:
-        InputError: for a root without usable clips, an impossible split, a bad file under `strict`, or a
-            folder that cannot be written.
+        InputError: if the root has no usable clips, the split is impossible, the folder cannot be written, or
+            a file is bad and `strict` is set.
     """
     source = replace(source, body=str(source.body))
     if source.min_frames < 2:
         raise InputError(
-            f"data.min_frames={source.min_frames}: must be 2 or more, as one frame has no velocity"
+            f"data.min_frames={source.min_frames}: must be 2 or more, because one frame has no velocity"
         )
     rest = load_rest_joints(source.body)
     clips = [source.root / file for file in find_clips(source.root).files]
@@ -73,31 +74,31 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
     try:
         out.mkdir(parents=True, exist_ok=True)
         with Lock(out).hold():
-            request = _request_digest(source, rest)
-            manifest = _load_finished(out, request)
+            request = _compute_request_digest(source, rest)
+            manifest = _load_if_current(out, request)
             if manifest and not (source.strict and manifest.skipped):
                 return manifest
-            manifest = _plan(source, rest, request)
-            _write(source, rest, manifest, out)
+            manifest = _plan_cache(source, rest, request)
+            _write_cache(source, rest, manifest, out)
             return manifest
     except OSError as error:
-        raise InputError(f"{out}: cannot write the cache there ({error.strerror or error})") from error
+        raise InputError(f"{out}: the cache cannot be written ({error.strerror or error})") from error
 
 
-def finished_cache(source: ClipFolder, out: Path) -> Manifest | None:
-    """Return the manifest of a finished, up-to-date cache of the source in `out`, or None."""
+def load_finished_cache(source: ClipFolder, out: Path) -> Manifest | None:
+    """Load the manifest of the source's cache in `out`; None if the cache is unfinished or outdated."""
     try:
-        return _load_finished(out, _request_digest(source, load_rest_joints(str(source.body))))
+        return _load_if_current(out, _compute_request_digest(source, load_rest_joints(str(source.body))))
     except InputError:
         return None
 
 
-def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
-    """Read the sources and split them; return the manifest of the cache to be written."""
+def _plan_cache(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
+    """Read the clips, split them, and return the manifest of the cache to write."""
     from memmlp.motion.preparing.duplicates import assign_parts  # scipy takes 0.4 s to import
-    from memmlp.motion.preparing.survey import survey
+    from memmlp.motion.preparing.survey import survey_folder
 
-    summary, split = survey(source.root, source.min_frames, source.strict), source.split
+    summary, split = survey_folder(source.root, source.min_frames, source.strict), source.split
     if not summary.clips:
         first = (
             f"; the first: {summary.skipped[0].file}: {summary.skipped[0].reason}" if summary.skipped else ""
@@ -108,9 +109,9 @@ def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
         )
     names = [clip.name for clip in summary.clips]
     parts, groups, duplicates = assign_parts(split, summary.clips)
-    files = [*names, *summary.short, *summary.damaged]
+    files = [*names, *summary.short, *summary.damaged_files]
     split.check_groups([name for name, part in parts.items() if part], files)
-    clips = _place(summary.clips, parts, groups)
+    clips = _place_clips(summary.clips, parts, groups)
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"data.root={source.root}: no clip for training; check data.split")
     left_out = [n for n, part in sorted(parts.items()) if part is None and n not in duplicates]
@@ -118,9 +119,9 @@ def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
     frames = [(clip.name, clip.split, clip.sha256) for clip in clips]
     ingredients = [FRAMES_VERSION, source.min_frames, rest.tolist(), frames]
     return Manifest(
-        digest=_hash([*ingredients, *([source.interpolation] if interpolated else [])]),
+        digest=_hash_json([*ingredients, *([source.interpolation] if interpolated else [])]),
         request=request,
-        body=body_name(source.body, rest),
+        body=format_body_name(source.body, rest),
         rest_joints=tuple(map(tuple, rest.tolist())),
         split=split.describe(),
         min_frames=source.min_frames,
@@ -128,18 +129,18 @@ def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
         clips=clips,
         skipped=summary.skipped,
         left_out=dict(Counter(name.split("/")[0] for name in left_out)),
-        listed=dict(split.listed),
-        missing=split.missing([*names, *summary.short]),
+        listed=dict(split.entry_counts),
+        missing=split.find_missing_entries([*names, *summary.short]),
         duplicates=duplicates,
         unusual=summary.unusual,
-        sources=tuple(source.root.sources) if isinstance(source.root, Folders) else (),
+        sources=tuple(source.root.sources) if isinstance(source.root, NamedFolders) else (),
     )
 
 
-def _place(
+def _place_clips(
     clips: Sequence[ClipRecord], parts: Mapping[str, str | None], groups: Mapping[str, str]
 ) -> tuple[ClipRecord, ...]:
-    """Return the clips that have a part, each with its group and its position in that part's array."""
+    """Return the clips of all parts, with their groups and their positions in the arrays."""
     ends = dict.fromkeys(PARTS, 0)
     placed = []
     for clip in clips:
@@ -150,15 +151,15 @@ def _place(
     return tuple(placed)
 
 
-def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
-    """Write the arrays under temporary names, then rename them, then write the manifest."""
+def _write_cache(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
+    """Write the arrays to temporary files, rename these files, then write the manifest."""
     check_owner(out)
     (out / MANIFEST).unlink(missing_ok=True)
     unfinished = {part: temporary_path(out / f"{part}.npy") for part in PARTS}
     try:
         _write_frames(source, rest, manifest, unfinished)
-        if _request_digest(source, rest) != manifest.request:
-            raise InputError(f"data.root={source.root}: changed while it was being prepared; run it again")
+        if _compute_request_digest(source, rest) != manifest.request:
+            raise InputError(f"data.root={source.root}: changed during preparation; run the command again")
         for part, path in unfinished.items():
             publish(path, out / f"{part}.npy")
     finally:
@@ -170,10 +171,10 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
 def _write_frames(
     source: ClipFolder, rest: np.ndarray, manifest: Manifest, paths: Mapping[str, Path]
 ) -> None:
-    from memmlp.motion.geometry import one_thread  # imports torch, like `frame_blocks`
+    from memmlp.motion.geometry import limit_to_one_thread  # imports torch
 
     with ExitStack() as stack:
-        stack.enter_context(one_thread())
+        stack.enter_context(limit_to_one_thread())
         files = {part: stack.enter_context(open(path, "wb")) for part, path in paths.items()}
         for part, file in files.items():
             shape = (manifest.totals[part].frames, FRAME_DIM)
@@ -181,37 +182,37 @@ def _write_frames(
             np.lib.format.write_array_header_1_0(file, header)
         for record in progress_bar(manifest.clips, "writing"):
             clip = read_clip(source.root / record.file, record.name)
-            for block in frame_blocks(resample(clip, interpolation=source.interpolation)[0], rest):
+            for block in compute_frame_blocks(resample(clip, interpolation=source.interpolation)[0], rest):
                 files[record.split].write(block.tobytes())
         for file in files.values():
             file.flush()
             os.fsync(file.fileno())
 
 
-def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
-    import torch  # takes seconds to import, and finding a finished cache does not need it
+def compute_frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield a 60 Hz clip's frames in blocks (<= CHUNK, 252): float32, computed in float64."""
+    import torch  # takes seconds to import; a finished cache does not need it
 
-    from memmlp.motion.geometry import motion_frames
+    from memmlp.motion.geometry import compute_motion_frames
 
     poses, trans, joints = (torch.from_numpy(np.ascontiguousarray(x)) for x in (clip.poses, clip.trans, rest))
     for start in range(0, len(clip) - 1, CHUNK):
-        block = slice(start, start + CHUNK + 1)  # one frame more than comes out, as the first has no velocity
-        yield motion_frames(poses[block], trans[block], joints).numpy().astype("<f4")
+        block = slice(start, start + CHUNK + 1)  # one extra frame, because the first has no velocity
+        yield compute_motion_frames(poses[block], trans[block], joints).numpy().astype("<f4")
 
 
-def _request_digest(source: ClipFolder, rest: np.ndarray) -> str:
-    """Return a digest of the settings and of each source's path, size and times, without opening any file."""
-    files = [(file, *_stamp(source.root / file)) for file in find_clips(source.root).files]
+def _compute_request_digest(source: ClipFolder, rest: np.ndarray) -> str:
+    """Return a digest of the settings and of each file's path, size and times. No file is opened."""
+    files = [(file, *_read_stamp(source.root / file)) for file in find_clips(source.root).files]
     code = [FORMAT, FRAMES_VERSION, VERSIONS["features"]]
     settings = [source.min_frames, source.interpolation, rest.tolist(), source.split.describe()]
-    return _hash([*code, *settings, files])
+    return _hash_json([*code, *settings, files])
 
 
-def _stamp(path: Path) -> tuple[int, int, int]:
-    """Return size and times of a file; zeros for a dangling link, which reading will skip.
+def _read_stamp(path: Path) -> tuple[int, int, int]:
+    """Return size, modification time and change time of a file; zeros for a dangling link.
 
-    Archives may set the modification time; the time of the last change cannot be set.
+    Archives can set the modification time, but not the change time.
     """
     try:
         stat = path.stat()
@@ -220,12 +221,12 @@ def _stamp(path: Path) -> tuple[int, int, int]:
     return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
 
 
-def _hash(value: Any) -> str:
+def _hash_json(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def _load_finished(out: Path, request: str) -> Manifest | None:
-    """Return the manifest in `out` if it matches the request and its arrays are complete, else None."""
+def _load_if_current(out: Path, request: str) -> Manifest | None:
+    """Load the manifest in `out`; None unless it matches the request and all arrays are complete."""
     try:
         manifest = Manifest.load(out)
         # Opening an array raises ValueError if its size contradicts its header.

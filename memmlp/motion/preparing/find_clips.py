@@ -1,4 +1,4 @@
-"""Finds the npz files of one or more folders: each file once, however many paths lead to it."""
+"""Finds the npz files in one or more folders. A file with several paths is listed once."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ SUFFIX = ".npz"  # in any letter case
 
 
 @dataclass(frozen=True)
-class Folders:
-    """Named folders of clips, used in place of one folder's path: `folders / "cmu/salsa/01.npz"`.
+class NamedFolders:
+    """Named folders of clips that can replace one folder's path: `folders / "cmu/salsa/01.npz"`.
 
     Attributes:
         sources: name -> folder.
@@ -23,8 +23,8 @@ class Folders:
     sources: Mapping[str, Path]
 
     @classmethod
-    def of(cls, paths: Sequence[Path]) -> Folders:
-        """Name folders after their own last parts. Raises InputError if two have the same name."""
+    def from_paths(cls, paths: Sequence[Path]) -> NamedFolders:
+        """Name each folder by the last component of its path. Raises InputError for equal names."""
         sources = {path.resolve().name: path for path in paths}
         if len(sources) < len(paths):
             raise InputError(
@@ -34,7 +34,7 @@ class Folders:
         return cls(sources)
 
     def __truediv__(self, file: str) -> Path:
-        """Return the path of a file below one of the folders."""
+        """Return the path of a file, given as "SOURCE/RELATIVE_PATH"."""
         source, _, rest = file.partition("/")
         return self.sources[source] / rest
 
@@ -43,40 +43,41 @@ class Folders:
 
     @property
     def name(self) -> str:
-        """The names of all sources."""
+        """The names of all sources, joined by "-"."""
         return "-".join(self.sources)
 
-    def resolve(self) -> Folders:
-        """Return the folders with absolute paths."""
-        return Folders({name: path.resolve() for name, path in self.sources.items()})
+    def resolve(self) -> NamedFolders:
+        """Return a copy with absolute paths."""
+        return NamedFolders({name: path.resolve() for name, path in self.sources.items()})
 
 
-Root = Path | Folders
-"""Where clips are."""
+Root = Path | NamedFolders
+"""The location of clips: one folder or several."""
 
 
 @dataclass
-class FoundFiles:
-    """The content of a folder; paths are relative to it.
+class FolderContent:
+    """The content of a folder, with relative paths.
 
     Attributes:
-        files: the npz files, sorted, each by the path that is nearest to the folder, real before linked.
-        unreadable: folders that cannot be listed -> why.
+        files: the npz files, sorted. Of several paths of a file, the shortest is listed, and real before
+            linked paths.
+        unreadable: folder that cannot be listed -> the reason.
     """
 
     files: list[str] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
 
 
-def find_clips(root: Root) -> FoundFiles:
-    """Find the npz files below one folder or several, also behind links. Hidden files are ignored.
+def find_clips(root: Root) -> FolderContent:
+    """Find the npz files below one or more folders. Links are followed, and hidden files are ignored.
 
     Raises:
-        InputError: if a folder does not exist or has no npz.
+        InputError: if a folder does not exist or has no npz files.
     """
     if isinstance(root, Path):
         return _find_in_folder(root)
-    result = FoundFiles()
+    result = FolderContent()
     for source, folder in root.sources.items():
         content = _find_in_folder(folder)
         result.files += [f"{source}/{file}" for file in content.files]
@@ -85,27 +86,27 @@ def find_clips(root: Root) -> FoundFiles:
     return result
 
 
-def clip_name(file: str) -> str:
-    """Return a clip's name: its path without the suffix."""
+def get_clip_name(file: str) -> str:
+    """Return a clip's name, which is its file's path without the suffix."""
     return file[: -len(SUFFIX)] if file.lower().endswith(SUFFIX) else file
 
 
-def source_of(clip: str) -> str:
-    """Return the source of a clip: if there are several sources, its name begins with the source's name."""
+def get_source_name(clip: str) -> str:
+    """Return a clip's source, which is the first component of its name if there are several sources."""
     return clip.split("/")[0]
 
 
-def _find_in_folder(root: Path) -> FoundFiles:
+def _find_in_folder(root: Path) -> FolderContent:
     if not root.is_dir():
-        raise InputError(f"data.root={root}: no such folder; expected the folder with your npz clips")
-    content, files = FoundFiles(), dict[object, str]()
-    folders = {_identity(root)}
+        raise InputError(f"data.root={root}: no such folder; must be the folder of your npz clips")
+    content, files = FolderContent(), dict[object, str]()
+    folders = {_identify_path(root)}
     level = [""]
-    while level:  # one depth after the other, so that of two paths the shorter one counts
+    while level:  # level by level, so the shortest of several paths is found first
         entries = [entry for folder in level for entry in _list_folder(root, folder, content)]
         level = []
         for path, is_folder in entries:
-            identity = _identity(root / path)
+            identity = _identify_path(root / path)
             if is_folder and identity not in folders:
                 folders.add(identity)
                 level.append(path)
@@ -113,12 +114,14 @@ def _find_in_folder(root: Path) -> FoundFiles:
                 files.setdefault(identity, path)
     content.files = sorted(files.values())
     if not content.files:
-        raise InputError(f"data.root={root}: no npz in it; make some with memmlp data synth or data import")
+        raise InputError(
+            f"data.root={root}: has no npz files; create them with memmlp data synth or memmlp data import"
+        )
     return content
 
 
-def _list_folder(root: Path, folder: str, content: FoundFiles) -> list[tuple[str, bool]]:
-    """Return the visible paths in a folder, real ones before links, and whether each is a folder itself."""
+def _list_folder(root: Path, folder: str, content: FolderContent) -> list[tuple[str, bool]]:
+    """Return the visible paths in a folder, real paths before links, and whether each is a folder."""
     try:
         with os.scandir(root / folder) as listing:
             shown = [entry for entry in listing if not entry.name.startswith(".")]
@@ -136,8 +139,8 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
         return False
 
 
-def _identity(path: Path) -> tuple[int, int] | str:
-    """Return a key that is the same for all paths of a file or folder; a dangling link equals only itself."""
+def _identify_path(path: Path) -> tuple[int, int] | str:
+    """Return a key that is equal for all paths of a file or folder, or the path of a dangling link."""
     try:
         stat = path.stat()
     except OSError:

@@ -1,9 +1,9 @@
-"""Groups of clips that are not independent: clips of the same subject, take or session.
+"""Groups of dependent clips, such as clips of the same subject, take or session.
 
-Clips of one group are never divided between parts, and statistics count a group once. Patterns, a column
-file, or both say which clips belong together: two clips that match the same pattern anywhere (`re.search`)
-with the same captured groups are tied, and so are two clips with the same group in the file. Remarks tell the
-user of clips that may belong together and are not tied.
+Clips of one group always get the same part of a split, and statistics count a group once. Groups come from
+patterns, a column file, or both. Two clips share a group if they match the same pattern (`re.search`) with
+equal captured text, or if the file gives both the same group. Warnings report clips that may need a common
+group.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ KEY = "data.split.groups_file"
 
 @dataclass(frozen=True)
 class Grouping:
-    """The rules that tie clips together.
+    """The rules that group clips.
 
     Attributes:
-        patterns: regular expressions.
+        patterns: regular expressions for clip names.
         rows: clip name -> its group in the column file; None without a file.
         file: the column file, for messages.
     """
@@ -41,11 +41,11 @@ class Grouping:
     file: Path | None = None
 
     @classmethod
-    def of(cls, patterns: Sequence[str], file: Path | str | None) -> Grouping:
-        """Make the grouping of patterns and of a column file, if there is one.
+    def from_settings(cls, patterns: Sequence[str], file: Path | str | None) -> Grouping:
+        """Make a grouping from patterns and an optional column file.
 
         Raises:
-            InputError: if the file can't be read, naming the line that is wrong.
+            InputError: if the file can't be read or has an invalid line.
         """
         return cls(tuple(patterns), read_groups(Path(file)) if file else None, Path(file) if file else None)
 
@@ -57,30 +57,30 @@ class Grouping:
         return hashlib.sha256(json.dumps(sorted(self.rows.items())).encode()).hexdigest()
 
     def check(self, names: Collection[str], files: Iterable[str]) -> None:
-        """Check that the column file lists every clip to be split, and only clips that have a file.
+        """Check that the column file lists every clip of the split, and only existing files.
 
         Args:
-            names: clips to be split.
-            files: names of all files, whether they are clips or not.
+            names: names of the clips to split.
+            files: names of all files, including invalid ones.
 
         Raises:
-            InputError: naming the first clip that is missing or unknown.
+            InputError: if a clip is missing in the column file, or a listed clip has no file.
         """
         if self.rows is None:
             return
         for problem, clips in (
             ("has no row for clip", set(names) - set(self.rows)),
-            ("has a row for a clip that is not below data.root:", set(self.rows) - set(files)),
+            ("has a row for a clip that is missing below data.root:", set(self.rows) - set(files)),
         ):
             if clips:
                 more = f" and {len(clips) - 1} more" if len(clips) > 1 else ""
                 raise InputError(f"{KEY}={self.file}: {problem} {min(clips)}{more}")
 
-    def tie(self, aliases: Mapping[str, str]) -> list[list[str]]:
-        """Return clips in groups; ties are transitive.
+    def group_clips(self, aliases: Mapping[str, str]) -> list[list[str]]:
+        """Group clips. Membership is transitive: overlapping groups are merged.
 
         Args:
-            aliases: clip name -> the name that patterns, and the order within a group, use.
+            aliases: clip name -> the name that patterns match and that determines the order in a group.
 
         Raises:
             InputError: if a pattern is not a regular expression.
@@ -104,19 +104,19 @@ class Grouping:
             groups.setdefault(find_root(parents, name), []).append(name)
         return list(groups.values())
 
-    def names(self, aliases: Mapping[str, str]) -> dict[str, str]:
-        """Map each clip to its group's name: the column file's, else the name of the group's first clip."""
+    def name_groups(self, aliases: Mapping[str, str]) -> dict[str, str]:
+        """Map each clip to its group's name: the name in the column file, or else the group's first clip."""
         rows = self.rows or {}
-        return {name: rows.get(group[0], group[0]) for group in self.tie(aliases) for name in group}
+        return {name: rows.get(group[0], group[0]) for group in self.group_clips(aliases) for name in group}
 
 
 def read_groups(file: Path) -> dict[str, str]:
-    """Read a column file: CSV with the columns `clip` and `group`; other columns are ignored.
+    """Read a column file: CSV with the columns `clip` and `group`. Other columns are ignored.
 
-    A clip is named by its path below the data's folder, with or without `.npz`.
+    The column `clip` has paths below the data folder, with or without `.npz`.
 
     Raises:
-        InputError: naming the line that is wrong.
+        InputError: if the file can't be read or has an invalid line.
     """
     try:
         with open(file, encoding="utf-8-sig", newline="") as stream:
@@ -124,9 +124,11 @@ def read_groups(file: Path) -> dict[str, str]:
             columns = table.fieldnames or ()
             rows = [(table.line_num, row) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{KEY}={file}: not a readable CSV file ({error})") from error
+        raise InputError(f"{KEY}={file}: cannot be read as CSV ({error})") from error
     if missing := [name for name in COLUMNS if name not in columns]:
-        raise InputError(f"{KEY}={file}: no column {missing[0]}; the first line must name clip and group")
+        raise InputError(
+            f"{KEY}={file}: has no column {missing[0]}; the first line must have the columns clip and group"
+        )
     groups: dict[str, str] = {}
     for line, row in rows:
         clip, group = ((row[name] or "").strip() for name in COLUMNS)
@@ -139,34 +141,34 @@ def read_groups(file: Path) -> dict[str, str]:
 
 
 def find_root(parents: dict[Any, Any], node: Any) -> Any:
-    """Return the root of a node in a union-find forest (node -> parent), halving the path on the way."""
+    """Find the root of a node in a union-find forest (node -> parent). The path is shortened."""
     while parents.setdefault(node, node) != node:
         parents[node] = parents[parents[node]]
         node = parents[node]
     return node
 
 
-# Remarks
+# Warnings
 
 
-def divided_remark(manifest: Manifest) -> str:
-    """Warn of folders with clips in both training and test that have no common group; empty without any.
+def describe_divided_folders(manifest: Manifest) -> str:
+    """Describe folders with ungrouped clips in both training and test; empty if there are none.
 
-    A folder is often a person or a session, unless it holds all clips of its source. Published lists are used
-    as they were published.
+    Such a folder often belongs to one person or session, unless it contains all clips of its source.
+    Published lists are not checked.
     """
     if manifest.split.get("kind") == "lists":
         return ""
     records = {clip.name: clip for clip in manifest.clips}
     folders: list[tuple[str, int]] = []
-    for prefix, split, names in _by_source(manifest.split, records):
-        held = Counter(folder for name in names for folder in _folders(name))
+    for prefix, split, names in _split_by_source(manifest.split, records):
+        held = Counter(folder for name in names for folder in _list_folders(name))
         parts: dict[str, list[str]] = defaultdict(list)
         for name in names:
             clip = records[prefix + name]
-            if clip.group == clip.name and not _is_tied(split, name):
-                own, *above = _folders(name)
-                # Where each take has a folder to itself, the person is the one above.
+            if clip.group == clip.name and not _matches_pattern(split, name):
+                own, *above = _list_folders(name)
+                # If each take has its own folder, the parent folder is the person's.
                 parts[next((folder for folder in (own, *above) if held[folder] > 1), own)].append(clip.split)
         folders += [
             (prefix + folder, found.count("test"))
@@ -175,45 +177,48 @@ def divided_remark(manifest: Manifest) -> str:
         ]
     if not folders:
         return ""
-    tested = f"{sum(count for _, count in folders)} test clips are tied to no others (data.split.groups)"
+    tested = (
+        f"{sum(count for _, count in folders)} test clips share no group with other clips (data.split.groups)"
+    )
     more = f" and {len(folders) - 1} more" if len(folders) > 1 else ""
-    return f"{tested}, but clips of their folders, {folders[0][0] or 'the top one'}{more}, are in training"
+    return f"{tested}, but training has clips of the same folders ({folders[0][0] or 'the top folder'}{more})"
 
 
-def unmatched_patterns_remark(split: Mapping[str, Any], names: Collection[str]) -> str:
-    """Warn that a split has patterns of groups and none of them matches a clip; empty otherwise.
+def describe_unmatched_patterns(split: Mapping[str, Any], names: Collection[str]) -> str:
+    """Describe group patterns that match no clip; empty if at least one pattern matches.
 
     Args:
         split: the split's settings (`Split.describe`).
-        names: clips' names.
+        names: names of the clips.
     """
     remarks = []
-    for prefix, own, below in _by_source(split, names):
+    for prefix, own, below in _split_by_source(split, names):
         patterns = own.get("groups", ())
-        if patterns and not any(_is_tied(own, name) for name in below):
+        if patterns and not any(_matches_pattern(own, name) for name in below):
             remarks.append(
                 f"{prefix.replace('/', ': ')}none of the {len(patterns)} patterns of data.split.groups "
-                f"matches a clip's name (the first is {patterns[0]}), so each clip counts as independent, "
-                "and clips of one person may be in training and in test; data/grouping@data.split=NAME has "
-                "patterns for other collections, and data.split.groups_file can list who is in which clip"
+                f"matches a clip's name (the first pattern is {patterns[0]}). So each clip counts as "
+                "independent, and clips of one person may be in training and in test; choose patterns for "
+                "other collections with data/grouping@data.split=NAME, or list the person of each clip in "
+                "data.split.groups_file"
             )
     return "; ".join(remarks)
 
 
-def _by_source(
+def _split_by_source(
     split: Mapping[str, Any], names: Iterable[str]
 ) -> Iterator[tuple[str, Mapping[str, Any], list[str]]]:
-    """Yield the prefix of each source's clips, its split, and its clips' names without the prefix."""
+    """Yield each source's name prefix, its split settings, and its clip names without the prefix."""
     sources = {f"{source}/": own for source, own in split.get("sources", {}).items()}
     for prefix, own in (sources or {"": split}).items():
         yield prefix, own, [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
 
 
-def _is_tied(split: Mapping[str, Any], name: str) -> bool:
+def _matches_pattern(split: Mapping[str, Any], name: str) -> bool:
     return any(re.search(pattern, strip_archives(name)) for pattern in split.get("groups", ()))
 
 
-def _folders(name: str) -> list[str]:
-    """Return the folders that a clip is in, the innermost first; "" at the top."""
+def _list_folders(name: str) -> list[str]:
+    """Return all folders above a clip, innermost first; [""] for a clip in the top folder."""
     folders = name.split("/")[:-1]
     return ["/".join(folders[:depth]) for depth in range(len(folders), 0, -1)] or [""]

@@ -1,4 +1,4 @@
-"""A split by person: who is in validation or test has no clip in training."""
+"""A split by person: training has no clips of the persons in validation or test."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.splits import Assignment, Split, rank
+from memmlp.motion.preparing.splits import Assignment, Split, make_sort_key
 
 
 @dataclass(frozen=True)
 class Kind:
-    """Persons with the same kind of motion.
+    """A kind of motion, and the persons who performed it.
 
     Attributes:
-        persons: their ids.
-        test: how many of them are for test.
-        val: how many of them are for validation.
+        persons: ids of the persons.
+        test: number of these persons in test.
+        val: number of these persons in validation.
     """
 
     persons: Sequence[str]
@@ -28,19 +28,19 @@ class Kind:
 
 @dataclass(frozen=True)
 class PersonSplit(Split):
-    """A split by person, balanced over kinds of motion. A person is a group.
+    """A split by person, balanced over kinds of motion. The clips of a person are a group.
 
-    The persons of each kind are sorted by a hash of seed and id. The first are for test, the next for
-    validation and the others for training, like everybody who is in no kind.
+    The persons of each kind are sorted by a hash of seed and id. The first persons are in test, the next in
+    validation, and all others in training. Persons without a kind are in training too.
 
     Args:
-        persons: pattern of clips' names -> the id of the person in these clips, in which `\\1` stands for the
-            pattern's first group; None leaves the clips out. The first pattern that matches counts.
-        kinds: kind of motion -> its persons; a person has one kind.
-        seed: seed of the order.
+        persons: pattern for clip names -> id of the person. `\\1` in the id is the pattern's first captured
+            group; None leaves the clips out. The first matching pattern applies.
+        kinds: name of a kind of motion -> its persons. A person must not have two kinds.
+        seed: seed of the order of persons.
 
     Raises:
-        InputError: for an invalid pattern or id, a person of two kinds, or a kind with too few persons.
+        InputError: for an invalid pattern or id, a person with two kinds, or a kind with too few persons.
     """
 
     persons: Mapping[str, str | None]
@@ -54,37 +54,38 @@ class PersonSplit(Split):
                 re.compile(f"{pattern}|").search("").expand(person or "")  # type: ignore[union-attr]
             except (re.error, IndexError) as error:
                 raise InputError(
-                    f"data.split.persons={pattern!r}: {error}; must be a pattern and an id"
+                    f"data.split.persons={pattern!r}: {error}; must map a valid pattern to a valid id"
                 ) from error
         every = [person for kind in self.kinds.values() for person in kind.persons]
         if twice := sorted({person for person in every if every.count(person) > 1}):
-            raise InputError(f"data.split.kinds: {twice[0]} has two kinds; must have one")
+            raise InputError(f"data.split.kinds: {twice[0]} has two kinds; a person must have only one kind")
         for name, kind in self.kinds.items():
-            if kind.test + kind.val > len(kind.persons):
-                few = f"{len(kind.persons)} persons for {kind.test} in test and {kind.val} in validation"
-                raise InputError(f"data.split.kinds.{name}: {few}; must have at least as many")
+            count = kind.test + kind.val
+            if count > len(kind.persons):
+                needed = f"{count} persons or more ({kind.test} for test, {kind.val} for validation)"
+                raise InputError(f"data.split.kinds.{name}: must have {needed}, not {len(kind.persons)}")
 
     @property
     def parts(self) -> dict[str, str]:
-        """The part of each person who has a kind."""
-        found: dict[str, str] = {}
+        """Person -> part, for all persons with a kind."""
+        part_of: dict[str, str] = {}
         for kind in self.kinds.values():
-            order = sorted(kind.persons, key=lambda person: rank(person, self.seed))
+            order = sorted(kind.persons, key=lambda person: make_sort_key(person, self.seed))
             counts = {"test": kind.test, "val": kind.val, "train": len(order)}
             parts = [part for part, count in counts.items() for _ in range(count)]
-            found |= dict(zip(order, parts, strict=False))
-        return found
+            part_of |= dict(zip(order, parts, strict=False))
+        return part_of
 
     def assign(self, names: Sequence[str]) -> Assignment:
         parts = self.parts
-        persons = {name: self.identify(name) for name in names}
+        persons = {name: self.identify_person(name) for name in names}
         return Assignment(
             {name: parts.get(person, "train") if person else None for name, person in persons.items()},
             {name: person or name for name, person in persons.items()},
         )
 
-    def identify(self, name: str) -> str | None:
-        """Return the id of the person in a clip; None for a clip that is left out.
+    def identify_person(self, name: str) -> str | None:
+        """Return the id of the person in a clip; None if the clip is left out.
 
         Raises:
             InputError: if the clip matches no pattern.
@@ -93,22 +94,22 @@ class PersonSplit(Split):
             if match := re.search(pattern, name):
                 return person and match.expand(person)
         raise InputError(
-            f"data.split.persons: no pattern matches {name}; must have one with the person's id, "
-            "or with null to leave the clip out"
+            f"data.split.persons: no pattern matches {name}; add a pattern with the person's id, or "
+            "with null to leave the clip out"
         )
 
     @property
-    def listed(self) -> Mapping[str, int]:  # type: ignore[override]
-        """The number of persons of each kind."""
+    def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Kind -> number of persons."""
         return {name: len(kind.persons) for name, kind in self.kinds.items()}
 
-    def missing(self, names: Collection[str]) -> tuple[str, ...]:
-        present = set(map(self.identify, names))
+    def find_missing_entries(self, names: Collection[str]) -> tuple[str, ...]:
+        present = set(map(self.identify_person, names))
         persons = [(name, person) for name, kind in self.kinds.items() for person in kind.persons]
         return tuple(f"{name}/{person}" for name, person in persons if person not in present)
 
     def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
-        """Do nothing: there is no column file."""
+        """Do nothing, because this split has no column file."""
 
     def describe(self) -> dict[str, Any]:
         kinds = {name: asdict(kind) for name, kind in self.kinds.items()}

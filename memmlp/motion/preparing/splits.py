@@ -1,12 +1,12 @@
-"""Splits, which assign clip names to train, val, test or nothing.
+"""Splits assign clips to train, val or test, or leave clips out.
 
-A clip's name is its path below the data root without suffix, `/`-separated. Clips that belong together
-(`Grouping`) are never divided. Entries of lists and names of subsets match AMASS' clips from any release
-(`amass_names`), and patterns of groups see names without the folder of an archive.
+A clip's name is its path below the data root without suffix, `/`-separated. All clips of a group (`Grouping`)
+get the same part. List entries and subset names match clips of any AMASS release (`amass_names`). Group
+patterns are matched with names without an archive's folder.
 
-Fractions count groups; a clip without ties is a group of its own. Nothing depends on the order of the names:
-groups are ranked by a hash of seed and name. So a new clip moves few others, and a smaller `train_fraction`
-takes some of the clips of a larger one.
+Fractions count groups; a clip without a common group counts as one group. Groups are sorted by a hash of seed
+and name. So an additional clip changes the parts of few other clips. A smaller `train_fraction` selects a
+subset of the clips of a larger one.
 """
 
 from __future__ import annotations
@@ -21,10 +21,15 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.amass_names import clip_key, present_subsets, strip_archives, subset
+from memmlp.motion.preparing.amass_names import (
+    find_present_subsets,
+    make_clip_key,
+    normalize_subset,
+    strip_archives,
+)
 from memmlp.motion.preparing.groups import Grouping
 
-LISTED = ("train", "test")  # the parts for which there are published lists
+LISTED = ("train", "test")  # the parts with published lists
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class Assignment:
 
     Attributes:
         parts: clip name -> "train", "val", "test", or None for a clip that is left out.
-        groups: clip name -> the name of its group; its own name if it is tied to no other clip.
+        groups: clip name -> name of its group; the clip's name without other members.
     """
 
     parts: Mapping[str, str | None]
@@ -41,45 +46,47 @@ class Assignment:
 
 
 class Split:
-    """The split slot's interface; the defaults suit a split that divides all clips in the folder."""
+    """The interface of the component slot `split`. The defaults suit a split that divides all clips."""
 
-    listed: Mapping[str, int] = {}
-    """The number of the split's entries by subset; empty if it divides all clips in the folder."""
+    entry_counts: Mapping[str, int] = {}
+    """Subset -> number of the split's entries; empty for a split that divides all clips in the folder."""
 
     groups_digest: str | None
-    """A digest of the column files that say which clips belong together; None without one."""
+    """A digest of the column files that group the clips; None without a file."""
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        """Return the part and the group of every name; raises InputError if the split is impossible."""
+        """Return the part and the group of each clip. Raises InputError if the split is impossible."""
         raise NotImplementedError
 
     def describe(self) -> dict[str, Any]:
-        """Return everything that determines `assign`, ready for JSON, without paths on this machine."""
+        """Return all settings that determine `assign`, as JSON values without local paths."""
         raise NotImplementedError
 
     def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
-        """Check that column files fit the clips to be split and all files (see `Grouping.check`)."""
+        """Check that the column files fit the clips to split and all files (see `Grouping.check`)."""
         raise NotImplementedError
 
-    def limit(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
-        """Return the clips' parts without the clips that the split leaves out of large groups."""
+    def limit_group_sizes(
+        self, parts: Mapping[str, str | None], groups: Mapping[str, str]
+    ) -> dict[str, str | None]:
+        """Return the parts after surplus clips of large groups are left out (None)."""
         return dict(parts)
 
-    def missing(self, names: Collection[str]) -> tuple[str, ...]:
-        """Return the entries of the split (list entries, subsets) that match none of the names."""
+    def find_missing_entries(self, names: Collection[str]) -> tuple[str, ...]:
+        """Return the split's entries (list entries, subsets) that match none of the clips."""
         return ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroupedSplit(Split):
-    """A split that divides groups of clips in a seeded order; the base of all but MixedSplit.
+    """Base class of splits that divide groups of clips in a seeded order.
 
     Args:
-        val: fraction of the groups for validation; 0 leaves it empty.
-        seed: seed of the order in which groups are taken.
-        groups: patterns of clips that stay together.
-        groups_file: column file that says which clips stay together; None for none.
-        train_fraction: fraction of train's groups that are used; the others are left out.
+        val: fraction of the groups for validation; 0 leaves validation empty.
+        seed: seed of the order of groups.
+        groups: patterns that group clips.
+        groups_file: column file that groups clips; None for no file.
+        train_fraction: fraction of the training groups that are used; the other groups are left out.
     """
 
     val: float = 0.05
@@ -101,13 +108,13 @@ class GroupedSplit(Split):
                 raise InputError(f"data.split.{key}={value}: must be at least 0 and below 1")
         if sum(fractions.values()) >= 1:
             raise InputError(
-                "data.split.test, data.split.val: must add up to less than 1: training needs the rest"
+                "data.split.test, data.split.val: the sum must be less than 1, because training gets the rest"
             )
 
     @cached_property
     def grouping(self) -> Grouping:
-        """The rules that tie clips together."""
-        return Grouping.of(self.groups, self.groups_file)
+        """The rules that group clips."""
+        return Grouping.from_settings(self.groups, self.groups_file)
 
     @property
     def groups_digest(self) -> str | None:  # type: ignore[override]
@@ -116,28 +123,32 @@ class GroupedSplit(Split):
     def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
         self.grouping.check(names, files)
 
-    def _description(self) -> dict[str, Any]:
+    def _describe_settings(self) -> dict[str, Any]:
         digest = self.groups_digest
         file = {"groups_file_sha256": digest} if digest else {}
         fewer = {"train_fraction": self.train_fraction} if self.train_fraction < 1 else {}
         return {"val": self.val, "seed": self.seed, "groups": list(self.groups), **file, **fewer}
 
-    def _divide(self, aliases: Mapping[str, str], fractions: Mapping[str, float]) -> dict[str, str | None]:
-        """Map clips to parts: the first groups in seeded order fill those of `fractions`, the others train.
+    def _divide_groups(
+        self, aliases: Mapping[str, str], fractions: Mapping[str, float]
+    ) -> dict[str, str | None]:
+        """Map clips to parts: the first groups in seeded order fill `fractions`' parts, the others train.
 
-        The last groups of train are left out (None), as `train_fraction` says.
+        If `train_fraction` is below 1, the last groups of train are left out (None).
 
         Args:
-            aliases: each clip's name -> the name that patterns and the seeded order use.
+            aliases: clip name -> the name for patterns and the seeded order.
             fractions: part -> its fraction of the groups.
 
         Raises:
             InputError: if there are fewer groups than parts.
         """
-        ranked = sorted(self.grouping.tie(aliases), key=lambda group: rank(aliases[group[0]], self.seed))
+        ranked = sorted(
+            self.grouping.group_clips(aliases), key=lambda group: make_sort_key(aliases[group[0]], self.seed)
+        )
         parts: dict[str, str | None] = dict.fromkeys(aliases, "train")
         start = 0
-        for part, count in _counts(len(ranked), fractions).items():
+        for part, count in _count_groups(len(ranked), fractions).items():
             for group in ranked[start : start + count]:
                 parts.update(dict.fromkeys(group, part))
             start += count
@@ -147,17 +158,20 @@ class GroupedSplit(Split):
         return parts
 
 
-def rank(name: str, seed: int) -> str:
-    """Return the key by which names are sorted for an order that depends on the seed alone."""
+def make_sort_key(name: str, seed: int) -> str:
+    """Return a sort key for a name, which gives a random order that depends only on the seed."""
     return hashlib.sha256(json.dumps([seed, name]).encode()).hexdigest()
 
 
-def _counts(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
-    """Return the number of groups of each part: its rounded share, and at least one unless that is 0.
+def _count_groups(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
+    """Return the number of groups of each part: the rounded fraction, but at least 1 unless it is 0.
 
-    One group is left for train.
+    At least one group remains for train.
     """
-    counts = {part: max(1, round(share * total)) if share > 0 else 0 for part, share in fractions.items()}
+    counts = {
+        part: max(1, round(part_fraction * total)) if part_fraction > 0 else 0
+        for part, part_fraction in fractions.items()
+    }
     needed = 1 + sum(count > 0 for count in counts.values())
     if total < needed:
         parts = ", ".join(["train", *(part for part, count in counts.items() if count)])
@@ -172,12 +186,12 @@ def _counts(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
 
 @dataclass(frozen=True, kw_only=True)
 class SeededSplit(GroupedSplit):
-    """A random split with a seed.
+    """A seeded random split.
 
     Args:
-        test: fraction of the groups for test (of the clips, if none are tied); 0 leaves it empty.
-        per_group: the largest number of clips of a group in test, and in validation; the others are left out,
-            since repetitions of a motion add little information. None for all clips.
+        test: fraction of the groups for test; 0 leaves test empty.
+        per_group: maximum number of clips of a group in test and in validation. The other clips are left out,
+            because repetitions of a motion add little information. None uses all clips.
     """
 
     test: float = 0.1
@@ -190,16 +204,18 @@ class SeededSplit(GroupedSplit):
     def assign(self, names: Sequence[str]) -> Assignment:
         aliases = {name: strip_archives(name) for name in names}
         parts, groups = (
-            self._divide(aliases, {"test": self.test, "val": self.val}),
-            self.grouping.names(aliases),
+            self._divide_groups(aliases, {"test": self.test, "val": self.val}),
+            self.grouping.name_groups(aliases),
         )
-        return Assignment(self.limit(parts, groups), groups)
+        return Assignment(self.limit_group_sizes(parts, groups), groups)
 
-    def limit(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
+    def limit_group_sizes(
+        self, parts: Mapping[str, str | None], groups: Mapping[str, str]
+    ) -> dict[str, str | None]:
         if self.per_group is None:
             return dict(parts)
         held_out: dict[str, list[str]] = defaultdict(list)
-        for name in sorted(parts, key=lambda name: rank(name, self.seed)):
+        for name in sorted(parts, key=lambda name: make_sort_key(name, self.seed)):
             if parts[name] in ("test", "val"):
                 held_out[groups[name]].append(name)
         left_out = (name for names in held_out.values() for name in names[self.per_group :])
@@ -207,18 +223,17 @@ class SeededSplit(GroupedSplit):
 
     def describe(self) -> dict[str, Any]:
         most = {"per_group": self.per_group} if self.per_group else {}
-        return {"kind": "seeded", "test": self.test, **self._description(), **most}
+        return {"kind": "seeded", "test": self.test, **self._describe_settings(), **most}
 
 
 @dataclass(frozen=True)
 class MixedSplit(Split):
-    """Several sources, each split by itself, so that each has all parts.
+    """A split of several sources, each of which has its own split and all parts.
 
-    A clip's name is the source's name, a `/`, and the clip's name in that source; the source's split sees the
-    latter.
+    A clip's name is "SOURCE/NAME". The source's split gets only NAME.
 
     Args:
-        splits: source's name -> its split.
+        splits: name of a source -> its split.
     """
 
     splits: Mapping[str, SeededSplit]
@@ -226,20 +241,22 @@ class MixedSplit(Split):
     def assign(self, names: Sequence[str]) -> Assignment:
         parts: dict[str, str | None] = {}
         groups: dict[str, str] = {}
-        for source, own in self._names_by_source(names):
+        for source, own in self._split_names_by_source(names):
             try:
-                found = self.splits[source].assign(own)
+                assignment = self.splits[source].assign(own)
             except InputError as error:
                 raise InputError(f"data.sources.{source}: {error}") from None
-            parts |= {f"{source}/{name}": part for name, part in found.parts.items()}
-            groups |= {f"{source}/{name}": f"{source}/{group}" for name, group in found.groups.items()}
+            parts |= {f"{source}/{name}": part for name, part in assignment.parts.items()}
+            groups |= {f"{source}/{name}": f"{source}/{group}" for name, group in assignment.groups.items()}
         return Assignment(parts, groups)
 
-    def limit(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
+    def limit_group_sizes(
+        self, parts: Mapping[str, str | None], groups: Mapping[str, str]
+    ) -> dict[str, str | None]:
         result: dict[str, str | None] = {}
-        for source, own in self._names_by_source(parts):
+        for source, own in self._split_names_by_source(parts):
             full = {name: f"{source}/{name}" for name in own}
-            limited = self.splits[source].limit(
+            limited = self.splits[source].limit_group_sizes(
                 {name: parts[full[name]] for name in own}, {name: groups[full[name]] for name in own}
             )
             result |= {full[name]: part for name, part in limited.items()}
@@ -254,38 +271,38 @@ class MixedSplit(Split):
         return hashlib.sha256(json.dumps(digests, sort_keys=True).encode()).hexdigest() if digests else None
 
     def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
-        every = dict(self._names_by_source(files))
-        for source, own in self._names_by_source(names):
+        every = dict(self._split_names_by_source(files))
+        for source, own in self._split_names_by_source(names):
             self.splits[source].check_groups(own, every[source])
 
-    def _names_by_source(self, names: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
+    def _split_names_by_source(self, names: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
         for source in self.splits:
             yield source, [rest for name in names if (rest := name.removeprefix(f"{source}/")) != name]
 
 
 class PublishedSplit(GroupedSplit):
-    """A split with published training and test parts; a seeded part of training becomes validation."""
+    """A split with published training and test parts. Validation is a seeded selection from training."""
 
     def _carve_validation(self, parts: Mapping[str, str | None], aliases: Mapping[str, str]) -> Assignment:
-        """Return the assignment with some of train's groups moved to "val"."""
+        """Return the assignment after some training groups are moved to "val"."""
         train = {name: aliases[name] for name, part in parts.items() if part == "train"}
         if not train:
-            raise InputError("data.split: data.root has no clip of its training part; is it the right root?")
-        carved = {**parts, **self._divide(train, {"val": self.val})}
-        return Assignment(carved, self.grouping.names(aliases))
+            raise InputError("data.split: data.root has no clip of the training part; check data.root")
+        carved = {**parts, **self._divide_groups(train, {"val": self.val})}
+        return Assignment(carved, self.grouping.name_groups(aliases))
 
 
 @dataclass(frozen=True)
 class ListSplit(PublishedSplit):
-    """Published lists (AvatarPoser, AGRoL): FOLDER/SUBSET/train_split.txt and test_split.txt.
+    """A split by published lists (AvatarPoser, AGRoL): FOLDER/SUBSET/train_split.txt and test_split.txt.
 
-    A line is the relative path of an npz; blank lines, CRLF, a leading `./` and anything before the subset's
-    own folder are accepted. An entry means the clip of that name, or else the clip that has that name
-    in another release of AMASS. Clips in no list are left out. Patterns of groups see an entry's name,
-    so that a list divides every release in the same way.
+    Each line is the relative path of an npz file. Blank lines, CRLF, a leading `./` and folders above the
+    subset's folder are accepted. An entry matches the clip with this name, or else the corresponding clip of
+    a different AMASS release. Clips without an entry are left out. Group patterns are matched with the
+    entries' names. So a list divides all releases in the same way.
 
     Args:
-        folder: where the user keeps the lists.
+        folder: the folder of the lists.
     """
 
     folder: Path
@@ -301,22 +318,22 @@ class ListSplit(PublishedSplit):
         parts = {name: self.entries.get(aliases[name]) for name in names}
         return self._carve_validation(parts, aliases)
 
-    def missing(self, names: Collection[str]) -> tuple[str, ...]:
+    def find_missing_entries(self, names: Collection[str]) -> tuple[str, ...]:
         return tuple(sorted(set(self.entries) - set(_match_entries(self.entries, names).values())))
 
     @property
-    def listed(self) -> Mapping[str, int]:  # type: ignore[override]
-        """The number of the split's entries by subset."""
+    def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Subset -> number of the split's entries."""
         return dict(Counter(entry.split("/")[0] for entry in sorted(self.entries)))
 
     def describe(self) -> dict[str, Any]:
         lists = hashlib.sha256(json.dumps(sorted(self.entries.items())).encode()).hexdigest()
-        return {"kind": "lists", "lists_sha256": lists, **self._description()}
+        return {"kind": "lists", "lists_sha256": lists, **self._describe_settings()}
 
 
 @dataclass(frozen=True)
 class SubsetSplit(PublishedSplit):
-    """A split by top-level folder, in any letter case and under any name that AMASS gave the subset.
+    """A split by top-level folder. Letter case and the differing subset names of AMASS releases are ignored.
 
     Clips in other folders are left out.
 
@@ -332,32 +349,35 @@ class SubsetSplit(PublishedSplit):
         super().__post_init__()
         if deeper := [name for name in (*self.train, *self.test) if "/" in name]:
             raise InputError(f"data.split: {deeper[0]} must be the name of a folder in data.root, without /")
-        both = set(map(subset, self.train)) & set(map(subset, self.test))
+        both = set(map(normalize_subset, self.train)) & set(map(normalize_subset, self.test))
         if both:
             raise InputError(f"data.split: subsets {', '.join(sorted(both))} are both in train and in test")
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        part_of = {subset(name): part for part in LISTED for name in getattr(self, part)}
+        part_of = {normalize_subset(name): part for part in LISTED for name in getattr(self, part)}
         aliases = {name: strip_archives(name) for name in names}
-        parts = {name: part_of.get(subset(name), part_of.get(subset(own))) for name, own in aliases.items()}
+        parts = {
+            name: part_of.get(normalize_subset(name), part_of.get(normalize_subset(own)))
+            for name, own in aliases.items()
+        }
         clips = defaultdict(list)
         for name in sorted(name for name, part in parts.items() if part):
-            clips[clip_key(name)].append(name)
+            clips[make_clip_key(name)].append(name)
         _check_one_release(clips.values())
         return self._carve_validation(parts, aliases)
 
-    def missing(self, names: Collection[str]) -> tuple[str, ...]:
-        present = present_subsets(names)
-        return tuple(name for name in (*self.train, *self.test) if subset(name) not in present)
+    def find_missing_entries(self, names: Collection[str]) -> tuple[str, ...]:
+        present = find_present_subsets(names)
+        return tuple(name for name in (*self.train, *self.test) if normalize_subset(name) not in present)
 
     @property
-    def listed(self) -> Mapping[str, int]:  # type: ignore[override]
-        """The number of the split's entries by subset."""
+    def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Subset -> number of the split's entries."""
         return dict.fromkeys((*self.train, *self.test), 1)
 
     def describe(self) -> dict[str, Any]:
         return {
-            "kind": "subsets", "train": list(self.train), "test": list(self.test), **self._description()
+            "kind": "subsets", "train": list(self.train), "test": list(self.test), **self._describe_settings()
         }  # fmt: skip
 
 
@@ -365,56 +385,63 @@ class SubsetSplit(PublishedSplit):
 
 
 def _match_entries(entries: Collection[str], names: Collection[str]) -> dict[str, str]:
-    """Map clips to their entries in a list: by name, else by the name in another release of AMASS."""
+    """Map clips to list entries: by the same name, or else by the name in a different AMASS release."""
     same = {name: name for name in names if name in entries}
-    others = {clip_key(entry).lower(): entry for entry in sorted(set(entries) - set(same), reverse=True)}
+    others = {make_clip_key(entry).lower(): entry for entry in sorted(set(entries) - set(same), reverse=True)}
     files_of = defaultdict(list)
     for name in sorted(set(names) - set(same)):
-        if (entry := others.get(clip_key(name).lower())) is not None:
+        if (entry := others.get(make_clip_key(name).lower())) is not None:
             files_of[entry].append(name)
     _check_one_release(files_of.values())
     return same | {clips[0]: entry for entry, clips in files_of.items()}
 
 
 def _check_one_release(matches: Iterable[Sequence[str]]) -> None:
-    """Raise InputError if several files, from several releases of AMASS, are the same clip."""
+    """Raise InputError if files from several AMASS releases are the same clip."""
     several = [clips for clips in matches if len(clips) > 1]
     if several:
         first, second = several[0][:2]
         raise InputError(
-            f"data.root: {len(several)} clips of the split match more than one file, the first {first}.npz "
-            f"and {second}.npz; keep one release of AMASS below it"
+            f"data.root: {len(several)} clips of the split match more than one file, such as {first}.npz "
+            f"and {second}.npz; keep only one AMASS release below data.root"
         )
 
 
 def _read_lists(folder: Path) -> dict[str, str]:
-    """Map clip names to "train" or "test", by all lists below a folder."""
+    """Read all lists below a folder, and map clip names to "train" or "test"."""
     files = {part: sorted(folder.rglob(f"{part}_split.txt")) for part in LISTED}
     if not files["train"]:
-        raise InputError(f"data.split.folder={folder}: no SUBSET/train_split.txt in it")
+        raise InputError(f"data.split.folder={folder}: has no SUBSET/train_split.txt")
     for subfolder in sorted({file.parent for part in LISTED for file in files[part]}):
         for part in LISTED:
             if subfolder / f"{part}_split.txt" not in files[part]:
                 raise InputError(
                     f"data.split.folder={folder}: {subfolder} lacks {part}_split.txt; "
-                    "a subset must have both lists, of which one may be empty"
+                    "each subset must have both lists; a list may be empty"
                 )
     entries: dict[str, str] = {}
     for part in LISTED:
         for file in files[part]:
             for name in _read_list(file):
                 if entries.setdefault(name, part) != part:
-                    raise InputError(f"{file}: {name} is both in a train and in a test list")
+                    raise InputError(f"{file}: {name} is in both a train list and a test list")
     return entries
 
 
 def _read_list(file: Path) -> Iterator[str]:
-    """Yield the clip names of a list; a path begins at the folder that is named like the list's own."""
+    """Yield the clip names of a list. Folders above the subset's folder are removed from the paths."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not a readable list ({error})") from error
+        raise InputError(f"{file}: cannot be read as a list ({error})") from error
     for line in filter(None, map(str.strip, lines)):
         steps = [step for step in line.removesuffix(".npz").split("/") if step not in ("", ".")]
-        start = next((i for i, step in enumerate(steps[:-1]) if subset(step) == subset(file.parent.name)), 0)
+        start = next(
+            (
+                i
+                for i, step in enumerate(steps[:-1])
+                if normalize_subset(step) == normalize_subset(file.parent.name)
+            ),
+            0,
+        )
         yield "/".join(steps[start:])

@@ -1,4 +1,4 @@
-"""Reads every npz of a folder once, so that bad, odd and duplicate files are known and reported."""
+"""Reads every npz file of a folder, and finds bad, unusual and duplicate clips."""
 
 from __future__ import annotations
 
@@ -12,90 +12,94 @@ from memmlp.common.errors import InputError, escape_line_breaks
 from memmlp.common.files import file_digest
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import LINES, Clip, Skipped, resample
-from memmlp.motion.formats.npz import NoMotion, read_clip
+from memmlp.motion.clip import LINES, Clip, SkippedFile, resample
+from memmlp.motion.formats.npz import NoMotionError, read_clip
 from memmlp.motion.plausibility import check_plausible
 from memmlp.motion.preparing.duplicates import (
-    Marks,
+    MarkedFrames,
+    compute_first_frames,
     find_resampled_copies,
     find_shared_stretches,
-    first_frames,
     mark_frames,
     merge_contents,
 )
-from memmlp.motion.preparing.find_clips import Root, clip_name, find_clips
+from memmlp.motion.preparing.find_clips import Root, find_clips, get_clip_name
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 
 
 @dataclass(frozen=True)
 class Survey:
-    """The content of a folder of npz files.
+    """The result of reading a folder of npz files.
 
     Attributes:
-        clips: sound clips, without split and group yet.
-        skipped: bad files.
-        short: names of the bad files that are sound clips with too few frames.
-        unusual: clip -> its faults, though it may be sound.
+        clips: valid clips; their split and group are still empty.
+        skipped: bad files, including too short clips.
+        short: names of the clips with too few frames.
+        unusual: clip -> its likely mistakes.
     """
 
     clips: tuple[ClipRecord, ...]
-    skipped: tuple[Skipped, ...]
+    skipped: tuple[SkippedFile, ...]
     short: tuple[str, ...]
     unusual: dict[str, str]
 
     @property
-    def damaged(self) -> tuple[str, ...]:
-        """Names of the bad files that are not just short."""
-        return tuple(name for file in self.skipped if (name := clip_name(file.file)) not in self.short)
+    def damaged_files(self) -> tuple[str, ...]:
+        """Names of the bad files, except for too short clips."""
+        return tuple(name for file in self.skipped if (name := get_clip_name(file.file)) not in self.short)
 
     @property
     def duplicates(self) -> dict[str, str]:
-        """Clip -> the first clip that shares motion with it."""
+        """Clip -> the first clip with common motion."""
         firsts: dict[str, str] = {}
         moving = [clip for clip in self.clips if clip.content != STILL]
         pairs = {clip.name: firsts.setdefault(clip.content, clip.name) for clip in moving}
         return {name: first for name, first in pairs.items() if name != first}
 
 
-class TooShort(InputError):
-    """A sound clip has too few frames."""
+class TooShortError(InputError):
+    """A valid clip has too few frames."""
 
 
-def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
-    """Read every npz below a folder.
+def survey_folder(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
+    """Read every npz file below a folder.
 
     Raises:
-        InputError: if there are none, or for the first bad file if `strict`.
+        InputError: if there are no npz files, or if `strict` is set and a file is bad.
     """
     clips: dict[str, ClipRecord] = {}
     firsts: dict[str, np.ndarray] = {}
-    marks: dict[str, tuple[Marks, Marks]] = {}
+    marks: dict[str, tuple[MarkedFrames, MarkedFrames]] = {}
     odd: dict[str, str] = {}
     short, content = [], find_clips(root)
-    skipped = [Skipped(folder, reason) for folder, reason in content.unreadable.items()]
+    skipped = [SkippedFile(folder, reason) for folder, reason in content.unreadable.items()]
     for file in progress_bar(content.files, "reading"):
-        path, name = root / file, clip_name(file)
+        path, name = root / file, get_clip_name(file)
         try:
             _check_name(path, file, clips)
             clip = read_clip(path, name)
             faults = check_plausible(path, clip)
-            resampled, method = resample(clip, interpolation=LINES)  # the survey is the same with either
+            resampled, method = resample(
+                clip, interpolation=LINES
+            )  # the result does not depend on the method
             if len(resampled) < min_frames:
                 few = f"{len(resampled)} frames at {FPS} Hz"
-                raise TooShort(f"{path}: {few}, fewer than data.min_frames={min_frames}")
-        except NoMotion:  # such as AMASS' files of shapes
+                raise TooShortError(f"{path}: {few}, fewer than data.min_frames={min_frames}")
+        except NoMotionError:  # such as AMASS' shape files
             continue
         except InputError as error:
             if strict:
                 raise
             skipped.append(
-                Skipped(escape_line_breaks(file), str(error).removeprefix(escape_line_breaks(f"{path}: ")))
+                SkippedFile(
+                    escape_line_breaks(file), str(error).removeprefix(escape_line_breaks(f"{path}: "))
+                )
             )
-            short += [name] if isinstance(error, TooShort) else []
+            short += [name] if isinstance(error, TooShortError) else []
         else:
-            digests = file_digest(path), _content_digest(clip)
+            digests = file_digest(path), _compute_content_digest(clip)
             clips[name] = ClipRecord(name, file, "", "", 0, len(resampled) - 1, *digests, clip.fps, method)
-            firsts[name], marks[name] = first_frames(clip), mark_frames(resampled)
+            firsts[name], marks[name] = compute_first_frames(clip), mark_frames(resampled)
             odd |= {name: faults} if faults else {}
     records = list(clips.values())
     records = merge_contents(records, find_resampled_copies(root, records, firsts))
@@ -104,17 +108,19 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
 
 
 def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
-    """Raise InputError unless the path is a regular file with a valid and new clip name."""
+    """Raise InputError unless the path is a regular file with a valid and unique clip name."""
     if escape_line_breaks(file) != file:
-        raise InputError(f"{path}: line feeds or other control characters in its name; rename it")
-    if clip_name(file) in clips:
-        raise InputError(f"{path}: {clips[clip_name(file)].file} has the same name; rename one of them")
+        raise InputError(f"{path}: the name has control characters; rename the file")
+    if get_clip_name(file) in clips:
+        raise InputError(
+            f"{path}: {clips[get_clip_name(file)].file} has the same name; rename one of the files"
+        )
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: not a regular file")
 
 
-def _content_digest(clip: Clip) -> str:
-    """Return a digest of the frames in single precision, whatever their saved type and stated frame rate."""
+def _compute_content_digest(clip: Clip) -> str:
+    """Return a digest of the frames in single precision. It ignores the saved type and the frame rate."""
     numbers = np.concatenate(
         [clip.poses.reshape(len(clip), -1), clip.trans], 1, dtype="<f4", casting="same_kind"
     )

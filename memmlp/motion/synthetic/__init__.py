@@ -1,4 +1,4 @@
-"""The embedded dataset: procedural motions of a plausible person as AMASS files, seeded, no download."""
+"""The synthetic dataset: seeded procedural motion of a plausible person, written as AMASS files."""
 
 from __future__ import annotations
 
@@ -13,34 +13,33 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.clip import FRAME_RATE_RANGE, Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.synthetic import actions, gait
-from memmlp.motion.synthetic.puppet import Puppet, solve
+from memmlp.motion.synthetic.puppet import Puppet, solve_joints
 
 Activity = Callable[[np.random.Generator, np.ndarray], Puppet]
 ACTIVITIES: dict[str, Activity] = {
-    "walking": gait.walking,
-    "running": gait.running,
-    "squatting": actions.squatting,
-    "sitting": actions.sitting,
-    "reaching": actions.reaching,
-    "waving": actions.waving,
-    "punching": actions.punching,
-    "jumping": actions.jumping,
-    "sidestepping": actions.sidestepping,
-    "idling": actions.idling,
+    "walking": gait.draw_walking,
+    "running": gait.draw_running,
+    "squatting": actions.draw_squatting,
+    "sitting": actions.draw_sitting,
+    "reaching": actions.draw_reaching,
+    "waving": actions.draw_waving,
+    "punching": actions.draw_punching,
+    "jumping": actions.draw_jumping,
+    "sidestepping": actions.draw_sidestepping,
+    "idling": actions.draw_idling,
 }
-CLIP_SECONDS = 14.0  # on average
+CLIP_SECONDS = 14.0  # mean duration
 MIN_CLIPS = 3  # train, validation and test
-MARGIN = 4.0  # seconds; a clip is a random excerpt of a performance that is longer by this
+MARGIN = 4.0  # seconds: a clip is a random excerpt of a performance that is longer by this margin
 
 
 def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 60.0) -> list[Path]:
-    """Write clips of 8 to 20 s, `minutes` in all, as `out`/<activity>/<activity>_<nnn>.npz.
+    """Write clips of 8 to 20 s with a total duration of `minutes`, as OUT/ACTIVITY/ACTIVITY_NNN.npz.
 
-    If that would make fewer than three clips, three shorter ones are written. The clips depend only
-    on the arguments.
+    At least three clips are written, which are shorter if necessary. The clips depend only on the arguments.
 
     Raises:
-        InputError: for bad arguments.
+        InputError: for invalid arguments.
     """
     low, high = FRAME_RATE_RANGE
     if not (math.isfinite(minutes) and minutes > 0):
@@ -50,11 +49,11 @@ def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 
     if not low <= fps <= high:
         raise InputError(f"fps={fps:g}: must be {low:g} to {high:g}")
     rng, seconds = np.random.default_rng(seed), minutes * 60.0
-    share = rng.uniform(0.6, 1.4, max(MIN_CLIPS, round(seconds / CLIP_SECONDS)))
-    ends = np.round(np.cumsum(share) / share.sum() * seconds * fps).astype(int)
+    fractions = rng.uniform(0.6, 1.4, max(MIN_CLIPS, round(seconds / CLIP_SECONDS)))
+    ends = np.round(np.cumsum(fractions) / fractions.sum() * seconds * fps).astype(int)
     lengths = [max(2, int(frames)) for frames in np.diff(ends, prepend=0)]
-    rounds = math.ceil(len(lengths) / len(ACTIVITIES))
-    names = np.concatenate([rng.permutation(list(ACTIVITIES)) for _ in range(rounds)])
+    repetitions = math.ceil(len(lengths) / len(ACTIVITIES))
+    names = np.concatenate([rng.permutation(list(ACTIVITIES)) for _ in range(repetitions)])
     paths = []
     for index, frames in enumerate(progress_bar(lengths, "synthesize")):
         name = str(names[index])
@@ -65,7 +64,7 @@ def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 
 
 
 def synthesize_clip(activity: str, seed: int, *, seconds: float = 14.0, fps: float = 60.0) -> Clip:
-    """Make one clip of the built-in body, named <activity>/<seed>, in float32.
+    """Make one float32 clip of the built-in body, with the name ACTIVITY/SEED.
 
     Raises:
         InputError: for an unknown activity.
@@ -76,6 +75,6 @@ def synthesize_clip(activity: str, seed: int, *, seconds: float = 14.0, fps: flo
     frames = max(2, round(seconds * fps))
     t = np.arange(frames + round(MARGIN * fps)) / fps
     first = int(rng.integers(len(t) - frames + 1))
-    poses, trans = solve(ACTIVITIES[activity](rng, t))
+    poses, trans = solve_joints(ACTIVITIES[activity](rng, t))
     cut = slice(first, first + frames)
     return Clip(f"{activity}/{seed}", poses[cut].astype(np.float32), trans[cut].astype(np.float32), fps)

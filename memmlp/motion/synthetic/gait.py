@@ -1,4 +1,4 @@
-"""Standing, walking and running: personal style, footwork, and a body that moves with the phase of a gait."""
+"""Standing, walking and running: a person's style, foot steps, and body motion by the phase of a gait."""
 
 from __future__ import annotations
 
@@ -8,32 +8,42 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.motion.synthetic.puppet import Array, Feet, FootStep, Puppet, ease, pulse, smooth, tread, wander
+from memmlp.motion.synthetic.puppet import (
+    Array,
+    Feet,
+    FootStep,
+    Puppet,
+    apply_foot_steps,
+    make_ease,
+    make_pulse,
+    make_wander,
+    smooth,
+)
 
 GRAVITY = 9.81
-STANDING = 0.992  # metres, the root's height with nearly straight legs
+STANDING = 0.992  # metres: height of the root with nearly straight legs
 FOLLOW = 0.3  # seconds within which the pelvis follows the feet
 LEFT_RIGHT = np.array([1.0, -1.0])
 
 
 @dataclass(frozen=True)
 class Style:
-    """The personal differences between clips; metres, radians."""
+    """The style of a person; metres, radians."""
 
-    origin: Array  # where (2,) the clip starts, world
-    heading: float  # in which direction the person faces at the start, world
-    width: float  # half the distance of the feet
-    splay: float  # how far each foot points outward
+    origin: Array  # start position (2,), world
+    heading: float  # start direction of the person, world
+    width: float  # half the distance between the feet
+    splay: float  # outward angle of each foot
     lean: float  # forward lean of the spine
     look: float  # pitch of the gaze, positive down
-    swing: float  # factor on the arms' swing
-    # positions (2, 3) of the wrists when the arms hang, from the shoulders: outward, up, forward
+    swing: float  # factor on the swing of the arms
+    # positions (2, 3) of the wrists relative to the shoulders, with hanging arms: outward, up, forward
     hands: Array
-    uneven: Array  # factor (2,) on the amplitude of left and right
+    uneven: Array  # factors (2,) on the amplitudes of left and right
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Style:
-        """Draw a person's style."""
+        """Draw a random style."""
         out, bent = rng.uniform(0.05, 0.14), rng.uniform(0.0, 0.05)
         hands = np.array([[out, -0.515 + bent, 0.03 + bent]] * 2) + rng.normal(0, 0.012, (2, 3))
         return cls(
@@ -49,14 +59,14 @@ class Style:
         )
 
 
-def direction(yaw: float | Array) -> Array:
-    """Return unit vectors (..., 2) on the floor."""
+def compute_direction(yaw: float | Array) -> Array:
+    """Return unit vectors (..., 2) on the floor, given angles in radians."""
     return np.stack([np.cos(yaw), np.sin(yaw)], -1)
 
 
 @dataclass(frozen=True)
 class FootPlacement:
-    """Both feet on the floor about a centre (2,): the left one to the left, and ahead by `stagger`."""
+    """Positions of both feet on the floor around a centre (2,). The left foot is ahead by `stagger`."""
 
     center: Array
     heading: float
@@ -67,7 +77,7 @@ class FootPlacement:
     @property
     def places(self) -> Array:
         """Positions (2, 2) below the ankles, world."""
-        along, left = direction(self.heading), direction(self.heading + np.pi / 2)
+        along, left = compute_direction(self.heading), compute_direction(self.heading + np.pi / 2)
         return self.center + LEFT_RIGHT[:, None] * (self.width * left + self.stagger * along)
 
     @property
@@ -78,7 +88,7 @@ class FootPlacement:
 
 @dataclass
 class Footwork:
-    """Changes of stance, one after the other, collected as steps."""
+    """A sequence of stance changes, collected as steps."""
 
     start: FootPlacement
     steps: list[FootStep] = field(default_factory=list)
@@ -86,7 +96,7 @@ class Footwork:
     def __post_init__(self) -> None:
         self.stance = self.start
 
-    def change(
+    def change_stance(
         self,
         off: float,
         duration: float,
@@ -94,69 +104,69 @@ class Footwork:
         shift: Array,
         turn: float = 0.0,
         first: int = 0,
-        **how: Any,
+        **step: Any,
     ) -> None:
-        """Move both feet to a new stance, one after the other.
+        """Move both feet to a new stance, one foot after the other.
 
         Args:
-            off: seconds at which the first foot leaves the floor.
-            duration: seconds that each foot is in the air.
-            delay: seconds by which the second foot leaves later.
-            shift: how far (2,) the stance's centre moves, metres, world.
-            turn: how far its heading turns, radians.
-            first: the foot that goes first, 0 left, 1 right.
-            how: the other attributes of FootStep.
+            off: time at which the first foot leaves the floor, seconds.
+            duration: time that each foot is in the air, seconds.
+            delay: delay of the second foot, seconds.
+            shift: translation of the stance's centre (2,), metres, world.
+            turn: change of the stance's heading, radians.
+            first: the first foot, 0 left, 1 right.
+            step: further attributes of FootStep.
         """
         s = self.stance = replace(
             self.stance, center=self.stance.center + shift, heading=self.stance.heading + turn
         )
         for foot, start in ((first, off), (1 - first, off + delay)):
-            self.steps.append(FootStep(foot, start, start + duration, s.places[foot], s.yaws[foot], **how))
+            self.steps.append(FootStep(foot, start, start + duration, s.places[foot], s.yaws[foot], **step))
 
-    def feet(self, t: Array) -> Feet:
-        """Return the feet at the times (N,)."""
-        return tread(t, self.start.places, self.start.yaws, self.steps)
+    def build_feet(self, t: Array) -> Feet:
+        """Return the feet at the times t (N,), seconds."""
+        return apply_foot_steps(t, self.start.places, self.start.yaws, self.steps)
 
 
 def stand(rng: np.random.Generator, t: Array, style: Style, work: Footwork | None = None) -> Puppet:
-    """Stand with hanging arms, sway a little, follow the feet; the pelvis goes over the carrying foot."""
+    """Make a standing person with hanging arms and a little sway, whose body follows the feet."""
     fps = 1.0 / (t[1] - t[0])
     work = work or Footwork(FootPlacement(style.origin, style.heading, style.width, style.splay))
-    feet = work.feet(t)
+    feet = work.build_feet(t)
     frames = round(FOLLOW * fps)
-    heading = smooth(feet.yaw.mean(1), frames) + 0.02 * wander(rng, t)
+    heading = smooth(feet.yaw.mean(1), frames) + 0.02 * make_wander(rng, t)
     ground = feet.ground[..., :2]
     load = smooth((feet.planted @ LEFT_RIGHT)[:, None] * (ground[:, 0] - ground[:, 1]), frames)
     pelvis = np.empty((len(t), 3))
-    pelvis[:, :2] = smooth(ground.mean(1), frames) + 0.3 * load + 0.012 * wander(rng, t, (2,), high=0.5)
-    pelvis[:, :2] += 0.02 * direction(heading)
-    pelvis[:, 2] = STANDING + 0.003 * wander(rng, t)
-    spine = 0.02 * wander(rng, t, (3,), high=0.6)
+    pelvis[:, :2] = smooth(ground.mean(1), frames) + 0.3 * load + 0.012 * make_wander(rng, t, (2,), high=0.5)
+    pelvis[:, :2] += 0.02 * compute_direction(heading)
+    pelvis[:, 2] = STANDING + 0.003 * make_wander(rng, t)
+    spine = 0.02 * make_wander(rng, t, (3,), high=0.6)
     spine[:, 0] += style.lean
     return Puppet(
         fps=fps,
         heading=heading,
         pelvis=pelvis,
         settle=0.12,
-        tilt=0.015 * wander(rng, t, (3,), high=0.6),
+        tilt=0.015 * make_wander(rng, t, (3,), high=0.6),
         spine=spine,
-        gaze=[style.look, 0.0] + wander(rng, t, (2,), high=0.4) * [0.05, 0.1],
+        gaze=[style.look, 0.0] + make_wander(rng, t, (2,), high=0.4) * [0.05, 0.1],
         feet=feet,
-        hands=style.hands + 0.012 * wander(rng, t, (2, 3), high=0.7),
-        wrists=0.06 * wander(rng, t, (2, 3)),
+        hands=style.hands + 0.012 * make_wander(rng, t, (2, 3), high=0.7),
+        wrists=0.06 * make_wander(rng, t, (2, 3)),
     )
 
 
-def occasions(
+def draw_occasions(
     rng: np.random.Generator, t: Array, length: tuple[float, float], pause: tuple[float, float]
 ) -> Iterator[tuple[float, float]]:
-    """Yield start and end, in seconds, of events that follow one another with pauses between.
+    """Draw successive events with pauses, and yield the start and end of each event, seconds.
 
     Args:
         rng: random generator.
         t: times (N,), seconds.
-        length: range of an event's length, seconds.
-        pause: range of a pause's length, seconds.
+        length: range of the duration of an event, seconds.
+        pause: range of the duration of a pause, seconds.
     """
     start = t[0] + rng.uniform(0.0, max(pause))
     while (end := start + rng.uniform(*length)) < t[-1]:
@@ -165,16 +175,16 @@ def occasions(
 
 
 def move_hand(puppet: Puppet, side: int, target: Array, weight: Array) -> None:
-    """Bring a wrist to `target` (3,) or (N, 3) by `weight` (N,) in [0, 1], on an arc in front of the body."""
+    """Move a wrist towards `target` (3,) or (N, 3) by `weight` (N,) in [0, 1], on an arc before the body."""
     w = weight[:, None]
     hand = puppet.hands[:, side]
     hand += w * (target - hand) + w * (1 - w) * np.array([0.15, 0.0, 0.5])
 
 
 def bend_knees(puppet: Puppet, depth: Array) -> None:
-    """Lower the pelvis by `depth` (N,) metres and keep the balance: pelvis back, trunk forward."""
+    """Lower the pelvis by `depth` (N,), metres. Pelvis and trunk keep the balance."""
     puppet.pelvis[:, 2] -= depth
-    puppet.pelvis[:, :2] -= 0.25 * depth[:, None] * direction(puppet.heading)
+    puppet.pelvis[:, :2] -= 0.25 * depth[:, None] * compute_direction(puppet.heading)
     puppet.tilt[:, 0] += 0.9 * depth
     puppet.spine[:, 0] += 0.5 * depth
     puppet.gaze[:, 0] += 0.3 * depth
@@ -185,24 +195,24 @@ def bend_knees(puppet: Puppet, depth: Array) -> None:
 
 @dataclass(frozen=True)
 class Gait:
-    """A gait; metres, seconds, radians. A cycle is two steps."""
+    """The parameters of a gait; metres, seconds, radians. A cycle is two steps."""
 
     speed: tuple[float, float]  # range of the full speed, m/s
-    cadence: tuple[float, float]  # cycles per second at zero speed, and the increase for each m/s
-    duty: float  # part of the cycle during which a foot is on the floor
-    ahead: float  # part of the contact that passes before the pelvis is over the foot
-    turn: float  # largest turn of the path at one time
-    width: float  # factor on the distance of the feet
-    sink: float  # how much lower the pelvis is than in standing
-    bounce: float  # amplitude of the pelvis' height
-    lift: float  # this and the next three as in FootStep, push in cycles
+    cadence: tuple[float, float]  # cycles per second at speed zero, and their increase per m/s
+    duty: float  # fraction of the cycle in which a foot is on the floor
+    ahead: float  # fraction of the contact before the pelvis is over the foot
+    turn: float  # maximum angle of one turn of the path
+    width: float  # factor on the distance between the feet
+    sink: float  # lowering of the pelvis relative to standing
+    bounce: float  # amplitude of the pelvis height
+    lift: float  # lift, heel, toe and push as in FootStep; push in cycles
     heel: float
     toe: float
     push: float
     lean: float  # forward lean of the spine
-    yaw: float  # amplitude of the pelvis' turn at full speed
+    yaw: float  # amplitude of the pelvis rotation at full speed
     swing: float  # amplitude of the hands' swing at full speed
-    elbow: tuple[float, float]  # how far the bent arms bring the hands up and forward
+    elbow: tuple[float, float]  # displacement of the hands by bent arms: up, forward
     settle: float  # as in Puppet
 
 
@@ -226,67 +236,67 @@ class Course:
     heading: Array  # directions (N,), radians, world
     pace: Array  # speeds (N,), m/s
     phase: Array  # phases (N,), cycles
-    go: Array  # 0 while standing and 1 while moving (N,)
+    go: Array  # 0 for standing to 1 for moving (N,)
 
 
-def walking(rng: np.random.Generator, t: Array) -> Puppet:
-    """Walk with turns; now and then one hand is raised."""
-    puppet = _locomotion(rng, t, WALK)
+def draw_walking(rng: np.random.Generator, t: Array) -> Puppet:
+    """Draw walking with turns, and sometimes a raised hand."""
+    puppet = _draw_locomotion(rng, t, WALK)
     if rng.random() < 0.3:
         side, target = int(rng.integers(2)), rng.uniform([0.0, -0.2, 0.2], [0.15, 0.1, 0.35])
-        for start, end in occasions(rng, t, (2.0, 5.0), (1.0, 5.0)):
-            move_hand(puppet, side, target, pulse(t, start, start + 0.9, end - 0.9, end))
+        for start, end in draw_occasions(rng, t, (2.0, 5.0), (1.0, 5.0)):
+            move_hand(puppet, side, target, make_pulse(t, start, start + 0.9, end - 0.9, end))
     return puppet
 
 
-def running(rng: np.random.Generator, t: Array) -> Puppet:
-    """Run with wide turns."""
-    return _locomotion(rng, t, RUN)
+def draw_running(rng: np.random.Generator, t: Array) -> Puppet:
+    """Draw running with wide turns."""
+    return _draw_locomotion(rng, t, RUN)
 
 
-def _locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
+def _draw_locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
     style = Style.draw(rng)
-    course = _course(rng, t, gait, style)
+    course = _draw_course(rng, t, gait, style)
     puppet = stand(rng, t, style)
-    puppet.feet = _feet(t, gait, style, course)
+    puppet.feet = _draw_feet(t, gait, style, course)
     puppet.settle = gait.settle
-    puppet.heading = course.heading + 0.02 * wander(rng, t)
+    puppet.heading = course.heading + 0.02 * make_wander(rng, t)
     puppet.pelvis += np.c_[course.path - style.origin, np.zeros(len(t))]
     _carry_along(puppet, gait, style, course)
     _swing_along(puppet, gait, style, course)
     return puppet
 
 
-def _course(rng: np.random.Generator, t: Array, gait: Gait, style: Style) -> Course:
-    """Draw a course: stand, move for most of the time with turns, stand."""
+def _draw_course(rng: np.random.Generator, t: Array, gait: Gait, style: Style) -> Course:
+    """Draw a course that starts and ends with standing, with motion and turns in between."""
     fps = 1.0 / (t[1] - t[0])
     start, stop = t[0] + rng.uniform(0.3, 1.2), t[-1] - rng.uniform(1.2, 2.0)
     top = rng.uniform(*gait.speed)
-    go = ease(t, start, start + 1.2) * (1 - ease(t, stop - 1.2, stop))
-    pace = top * go * (1 + 0.05 * wander(rng, t, high=0.4))
-    heading = style.heading + 0.06 * go * wander(rng, t, high=0.3)
-    for a, b in occasions(rng, t, (1.6, 3.0), (0.5, 4.0)):
-        heading = heading + rng.uniform(-gait.turn, gait.turn) * ease(t, a, b)
-    path = style.origin + np.cumsum(pace[:, None] * direction(heading), 0) / fps
-    cadence = (gait.cadence[0] + gait.cadence[1] * pace) * (1 + 0.02 * wander(rng, t))
-    stepping = pulse(t, start - 0.1, start + 0.3, stop + 0.3, stop + 0.9)
+    go = make_ease(t, start, start + 1.2) * (1 - make_ease(t, stop - 1.2, stop))
+    pace = top * go * (1 + 0.05 * make_wander(rng, t, high=0.4))
+    heading = style.heading + 0.06 * go * make_wander(rng, t, high=0.3)
+    for a, b in draw_occasions(rng, t, (1.6, 3.0), (0.5, 4.0)):
+        heading = heading + rng.uniform(-gait.turn, gait.turn) * make_ease(t, a, b)
+    path = style.origin + np.cumsum(pace[:, None] * compute_direction(heading), 0) / fps
+    cadence = (gait.cadence[0] + gait.cadence[1] * pace) * (1 + 0.02 * make_wander(rng, t))
+    stepping = make_pulse(t, start - 0.1, start + 0.3, stop + 0.3, stop + 0.9)
     phase = gait.duty - 0.02 + rng.choice([0.0, 0.5]) + np.cumsum(cadence * stepping) / fps
     return Course(path, heading, pace, phase, go)
 
 
-def _feet(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
-    """Make the steps: the left foot comes down at every whole phase, the right one half a cycle later."""
+def _draw_feet(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
+    """Draw the feet. The left foot touches down at whole phases, the right foot half a cycle later."""
     start = FootPlacement(style.origin, float(course.heading[0]), style.width, style.splay)
     steps = []
     for side in (0, 1):
         first = np.ceil(course.phase[0] + 1 - gait.duty - side / 2) + side / 2
         for strike in np.arange(first, course.phase[-1]):
-            steps.append(_step(t, gait, style, course, side, strike))
-    return tread(t, start.places, start.yaws, steps)
+            steps.append(_make_step(t, gait, style, course, side, strike))
+    return apply_foot_steps(t, start.places, start.yaws, steps)
 
 
-def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike: float) -> FootStep:
-    """Make the step that ends at phase `strike`; it is small and flat where the pace is low."""
+def _make_step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike: float) -> FootStep:
+    """Make the step that ends at phase `strike`. At a low pace, steps are small and flat."""
     off, on, over = np.interp(
         [strike - 1 + gait.duty, strike, strike + gait.ahead * gait.duty], course.phase, t
     )
@@ -304,9 +314,9 @@ def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike:
 
 
 def _carry_along(puppet: Puppet, gait: Gait, style: Style, course: Course) -> None:
-    """Move the pelvis: over the carrying foot, up and down twice a cycle, and leaning into turns."""
+    """Move the pelvis over the standing foot, up and down twice per cycle, and lean into turns."""
     cycle = 2 * np.pi * course.phase
-    left = direction(course.heading + np.pi / 2)
+    left = compute_direction(course.heading + np.pi / 2)
     inward = 0.6 * course.pace * np.gradient(course.heading) * puppet.fps / GRAVITY
     inward = smooth(inward, round(0.3 * puppet.fps)).clip(-0.35, 0.35)
     effort = course.go * course.pace / gait.speed[1]
@@ -320,7 +330,7 @@ def _carry_along(puppet: Puppet, gait: Gait, style: Style, course: Course) -> No
 
 
 def _swing_along(puppet: Puppet, gait: Gait, style: Style, course: Course) -> None:
-    """Turn the shoulders against the pelvis, swing the hands against the legs, look ahead into the turn."""
+    """Rotate the shoulders opposite to the pelvis, swing the hands, and look ahead in turns."""
     cycle = 2 * np.pi * course.phase
     effort = course.go * course.pace / gait.speed[1]
     puppet.spine[:, 0] += gait.lean * effort + 0.012 * effort * np.cos(2 * cycle)

@@ -10,10 +10,10 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import load_rest_joints
-from memmlp.motion.clip import Skipped
+from memmlp.motion.clip import SkippedFile
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.geometry import clip_kinematics
-from memmlp.motion.preparing.find_clips import clip_name, find_clips
+from memmlp.motion.geometry import compute_clip_kinematics
+from memmlp.motion.preparing.find_clips import find_clips, get_clip_name
 from memmlp.report.pictures.drawing import Camera, draw_skeleton, freeze_layout, make_panels
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ SIDE = np.deg2rad(35)  # the camera's angle from the person's front, radians
 
 def read_sample(
     source: Path, count: int, body: str = "builtin"
-) -> tuple[list[tuple[str, np.ndarray]], list[Skipped], int]:
+) -> tuple[list[tuple[str, np.ndarray]], list[SkippedFile], int]:
     """Read an npz file, or `count` files from a folder, evenly spaced in the order of their names.
 
     Returns:
@@ -44,11 +44,11 @@ def read_sample(
     for index in np.unique(np.linspace(0, len(files) - 1, min(count, len(files))).round().astype(int)):
         file = files[index]
         try:
-            clip = read_clip(top / file, clip_name(file))
+            clip = read_clip(top / file, get_clip_name(file))
         except InputError as error:
-            skipped.append(Skipped(file, str(error).removeprefix(f"{top / file}: ")))
+            skipped.append(SkippedFile(file, str(error).removeprefix(f"{top / file}: ")))
         else:
-            clips.append((clip.name, clip_kinematics(clip, rest)[1]))
+            clips.append((clip.name, compute_clip_kinematics(clip, rest)[1]))
     if not clips:
         first = f"{skipped[0].file}: {skipped[0].reason}"
         raise InputError(f"{source}: none of {len(skipped)} files could be read, for example {first}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from memmlp.motion.limb_shapes import HEAT, LIMBS, ends
+from memmlp.motion.limb_shapes import HEAT, LIMBS, find_limb_ends
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,13 +114,13 @@ def draw_skeleton(
 def _draw_limbs(axes: Axes, camera: Camera, joints: np.ndarray, errors: np.ndarray | None) -> None:
     """Draw each limb as overlapping discs, with dark edges and a highlight; distant limbs come first."""
     part = np.linspace(0, 1, DISCS)
-    limits = np.array([[camera.project(point) for point in ends(limb, joints)] for limb in LIMBS])
+    limits = np.array([[camera.project(point) for point in find_limb_ends(limb, joints)] for limb in LIMBS])
     centres = limits[:, :1] + part[:, None] * (limits[:, 1:] - limits[:, :1])  # (limb, disc, 3)
     first, last = np.array([limb.radii for limb in LIMBS]).T[..., None]
     radii = first + part * (last - first)
     colours = np.broadcast_to(NEUTRAL, (*radii.shape, 3))
     if errors is not None:
-        begin, end = errors[[limb.first for limb in LIMBS]], errors[[limb.end for limb in LIMBS]]
+        begin, end = errors[[limb.first_joint for limb in LIMBS]], errors[[limb.end for limb in LIMBS]]
         colours = make_heat_colours()(begin[:, None] + part * (end - begin)[:, None])[..., :3]
     order = np.argsort(centres[..., 2].mean(1))
     size = 1 - 0.85 * TONES[:, None, None]
@@ -151,7 +151,7 @@ def _draw_floor(axes: Axes, camera: Camera, joints: np.ndarray, floor: float, ra
     axes.add_collection(
         LineCollection(list(places), colors=[(0, 0, 0, dark) for dark in fade], linewidths=0.8)
     )
-    feet = np.concatenate([ends(limb, joints) for limb in LIMBS])
+    feet = np.concatenate([find_limb_ends(limb, joints) for limb in LIMBS])
     spread = SHADOW + 0.25 * np.maximum(
         np.nan_to_num(feet[:, 2:]) - floor, 0
     )  # higher joints: wider, fainter

@@ -9,7 +9,7 @@ import numpy as np
 
 from memmlp.common.files import atomic_write
 from memmlp.motion.importing.convert import StanceView
-from memmlp.motion.importing.skeleton_map import Z_UP, without_namespace
+from memmlp.motion.importing.skeleton_map import Z_UP, strip_namespace
 from memmlp.motion.limb_shapes import RADII
 from memmlp.report.pictures.drawing import Camera, draw_skeleton, encode_png, freeze_layout, make_panels
 
@@ -32,7 +32,7 @@ def write_skeleton_picture(path: Path, stance: StanceView, title: str) -> None:
         panel.set_xlabel(label)
     freeze_layout(figure)
     names, front, side, body_front, body_side = panels[0]
-    nodes = without_namespace(stance.nodes)
+    nodes = strip_namespace(stance.nodes)
     for row, (joint, node) in enumerate(
         sorted(stance.mapped.items(), key=lambda one: find_joint_colour(one[0]))
     ):

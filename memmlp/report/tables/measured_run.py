@@ -162,7 +162,7 @@ class MeasuredRun:
             patterns: regular expressions, as in `data.split.groups`.
         """
         grouping = Grouping(tuple(patterns), {clip: self.get_group(clip) for clip in self.clips})
-        groups = grouping.tie({clip: clip for clip in self.clips})
+        groups = grouping.group_clips({clip: clip for clip in self.clips})
         return replace(self, groups={clip: group[0] for group in groups for clip in group})
 
     def split_by_source(self) -> dict[str, MeasuredRun]:

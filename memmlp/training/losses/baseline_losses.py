@@ -54,7 +54,7 @@ class AGRoLLoss(Loss):
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return the rotation term for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
-        origin = normalizer.origin(sparse)
+        origin = normalizer.find_origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         return {"rotation_all": self.error(error[..., ROTATION])}
 
@@ -86,7 +86,7 @@ class AvatarPoserLoss(Loss):
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         error = (motion - truth)[..., ROTATION].abs()
-        position = self.anchored(normalizer.pose(motion, sparse)) - self.anchored(joints(truth))
+        position = self.anchored(normalizer.compute_positions(motion, sparse)) - self.anchored(joints(truth))
         return {
             "orientation": error[..., :6].mean(),
             "rotation": error[..., 6:].mean(),
@@ -132,7 +132,7 @@ class RPMLoss(Loss):
         self.weighting = FixedWeights(read_weights(settings or RPMLossSettings()))
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        origin = normalizer.origin(sparse)
+        origin = normalizer.find_origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         rotations, pair = error[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
         positions = (pair.positions - pair.true_positions).flatten(-2)

@@ -13,7 +13,7 @@ from memmlp.common.components import component
 from memmlp.common.errors import InputError
 from memmlp.common.settings import Settings, at_least, positive, setting
 from memmlp.motion.body import N_JOINTS, POSITION
-from memmlp.motion.normalizer import Normalizer, in_float32
+from memmlp.motion.normalizer import Normalizer, use_float32
 
 Terms = dict[str, Tensor]
 
@@ -172,6 +172,6 @@ class Loss(nn.Module):
 
         The loss is computed in float32, because velocities and jerk are small differences.
         """
-        with in_float32(truth.device):
+        with use_float32(truth.device):
             terms = self.terms(motion.to(truth.dtype), truth, sparse, normalizer)
             return self.weighting(terms), terms

@@ -74,7 +74,9 @@ class KinematicHandTerm:
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return the hand term for motion and truth (B, T, 198) and inputs (B, T, 54), all in the world."""
         hands = list(HANDS)
-        return {"hand": l1(normalizer.pose(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])}
+        return {
+            "hand": l1(normalizer.compute_positions(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])
+        }
 
 
 Hand = NoHandTerm | PositionHandTerm | KinematicHandTerm
@@ -120,7 +122,7 @@ class MotionLoss(Loss):
         self.term = term or Term()
         # The weighting gets the terms' names from two frames of zeros.
         probe = torch.zeros(1, 2, FRAME_DIM)
-        normalizer = Normalizer.raw(World(), torch.zeros(N_JOINTS, 3))
+        normalizer = Normalizer.from_coordinates(World(), torch.zeros(N_JOINTS, 3))
         motion = probe[..., SPARSE_DIM:]
         probed = motion, motion, probe[..., :SPARSE_DIM], normalizer
         own = dict.fromkeys(self._compute_custom_term(*probed), self.term.weight)

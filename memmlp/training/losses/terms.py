@@ -19,7 +19,7 @@ from memmlp.common.components import component, find_chosen_settings
 from memmlp.common.errors import InputError
 from memmlp.common.settings import at_least, one_of, positive, setting
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_POSITION
-from memmlp.motion.geometry import forward_kinematics, geodesic_angle, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.geometry import compute_geodesic_angle, forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import (
     CompleteLossSettings,
@@ -128,7 +128,7 @@ class Comparison:
 
     def angle(self, error: Error) -> Tensor:
         """Return the mean angle between predicted and true global rotations, in radians."""
-        return geodesic_angle(self.predicted.global_pose[0], self.truth.global_pose[0]).mean()
+        return compute_geodesic_angle(self.predicted.global_pose[0], self.truth.global_pose[0]).mean()
 
     def sixd_velocity(self, error: Error) -> Tensor:
         """Return the error of the frame-to-frame differences of all local 6D rotations."""

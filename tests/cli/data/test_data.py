@@ -47,7 +47,9 @@ def test_a_cache_has_the_clips_of_training(memmlp, tmp_path: Path, monkeypatch: 
     (tmp_path / "clips").mkdir()
     monkeypatch.chdir(tmp_path)
     found: list[ClipFolder] = []
-    monkeypatch.setattr("memmlp.motion.preparing.cache.prepare", lambda source, out: found.append(source))
+    monkeypatch.setattr(
+        "memmlp.motion.preparing.cache.prepare_cache", lambda source, out: found.append(source)
+    )
     monkeypatch.setattr(commands, "show_manifest", lambda manifest: None)
     for words, train in (
         (["data.split.val=0.2"], ["data=mocap", "data.split.val=0.2"]),
@@ -71,4 +73,4 @@ def test_folders_in_training_and_in_test_are_reported(memmlp, tmp_path: Path):
     prepared = memmlp("data", "prepare", str(tmp_path / "own"), "--out", cache, "data.split.test=0.4")
     for ran in (prepared, memmlp("data", "inspect", cache)):
         assert ran.code == 0, ran.err
-        assert "test clips are tied to no others (data.split.groups)" in ran.out
+        assert "test clips share no group with other clips (data.split.groups)" in ran.out

@@ -42,7 +42,7 @@ def test_verify_goes_on_and_names_file_joint_and_frame(source: Path) -> None:
     lines = output.splitlines()
     changes = "b.bvh: left_elbow to left_wrist changes its length by 5"
     assert [line for line in lines if line.startswith(changes) and "(most in frame 31)" in line]
-    assert [line for line in lines if line.startswith("c.bvh: no MOTION")]
+    assert [line for line in lines if line.startswith("c.bvh: has no MOTION")]
     assert [line for line in lines if line.startswith("d.bvh: has an unknown skeleton")]
     assert "1 file without a fault" in output
     assert "3 faults" in output
@@ -61,7 +61,7 @@ def test_import_warns_of_the_same_faults(source: Path) -> None:
     (source / "a.bvh").rename(source / "dataset-1_walk_active_001.bvh")
     output = run(source.parent, "data", "import", "source", "--out", "a folder")
     assert f"warning: b.bvh: {'; '.join(sentences)}" in output.splitlines()
-    assert "skipped c.bvh: no MOTION" in output
+    assert "skipped c.bvh: has no MOTION" in output
     assert len(list((source.parent / "a folder").glob("*.npz"))) == 2
     assert "2 clips, 1.0 seconds, skeleton cmu_daz" in output
     assert "next: memmlp train data=mocap 'data.root=a folder'" in output

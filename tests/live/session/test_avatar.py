@@ -19,10 +19,10 @@ from memmlp.live.session.loop import convert_to_millimetres, make_avatar_message
 from memmlp.live.session.server import Hub, LiveServer, load_page_files, make_mannequin_vrm
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.stream import BodyFrame
-from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.formats.gltf import VRM_BONES as VRM
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 RANDOM = np.random.default_rng(2)
 
 

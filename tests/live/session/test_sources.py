@@ -30,7 +30,7 @@ from memmlp.live.session.sources import (
     read_npz_frames,
 )
 from memmlp.live.tracker_resampling import TRACKERS
-from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.body import make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 
@@ -243,7 +243,7 @@ def test_an_unusual_file_is_reported_and_a_short_one_rejected(tmp_path: Path):
     write_clip(tmp_path / "b.npz", Clip("b", turns[:2], np.zeros((2, 3)), 60.0))
     said: list[str] = []
     with send_announcements_to(said.append):
-        assert len(read_npz_frames(tmp_path / "a.npz", builtin_rest_joints())) == 4
+        assert len(read_npz_frames(tmp_path / "a.npz", make_builtin_rest_joints())) == 4
         with pytest.raises(InputError, match=r"b\.npz: has 2 frames"):
-            read_npz_frames(tmp_path / "b.npz", builtin_rest_joints())
+            read_npz_frames(tmp_path / "b.npz", make_builtin_rest_joints())
     assert said[0].startswith(f"{tmp_path / 'a.npz'}: is unusual")

@@ -14,9 +14,9 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats.bvh import MAX_JOINTS, TIPS, euler_zxy, read_bvh, write_bvh
+from memmlp.motion.formats.bvh import MAX_JOINTS, TIPS, compute_euler_zxy, read_bvh, write_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import NONE
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder
@@ -115,7 +115,7 @@ def test_trees_and_kinematics_are_those_of_the_text(tmp_path: Path, sample: Samp
     sample.ends.sort(key=lambda end: order.index(end[0]))
     assert bvh.nodes[count:] == tuple(f"joint{joint}.end" for joint, _ in sample.ends)
     np.testing.assert_array_equal(bvh.offsets[count:].tolist(), [offset for _, offset in sample.ends])
-    for computed, expected in zip(bvh.kinematics(), naive_kinematics(sample), strict=True):
+    for computed, expected in zip(bvh.compute_kinematics(), naive_kinematics(sample), strict=True):
         np.testing.assert_allclose(computed, expected, atol=1e-9)
 
 
@@ -240,7 +240,7 @@ def test_deep_and_wide_hierarchies(tmp_path: Path) -> None:
 # What is written as BVH is read again as the same motion
 
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 QUARTERS = st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])  # of a turn: gimbal lock, and no rotation
 ANGLES = QUARTERS | st.floats(-np.pi, np.pi)
 RATES = st.sampled_from([24.0, 29.97, 30.0, 59.94, 60.0, 100.0, 120.0, 240.0])
@@ -298,7 +298,7 @@ def test_a_body_of_ones_own_comes_back(tmp_path: Path):
 def test_the_zero_pose_is_the_body_in_centimetres(tmp_path: Path):
     write_bvh(tmp_path / "clip.bvh", Clip("clip", np.zeros((2, 22, 3)), np.ones((2, 3)), 60.0), REST)
     bvh = read_bvh(tmp_path / "clip.bvh")
-    zero = dict(zip(bvh.nodes, bvh.zero_pose(), strict=True))
+    zero = dict(zip(bvh.nodes, bvh.compute_zero_pose(), strict=True))
     np.testing.assert_allclose([zero[joint] for joint in JOINTS], 100 * REST, atol=1e-5)
     assert set(bvh.nodes[len(JOINTS) :]) == {f"{joint}.end" for joint in TIPS}
     assert bvh.channels[0][:3] == ("Xposition", "Yposition", "Zposition")
@@ -311,7 +311,7 @@ def test_up_is_up(tmp_path: Path):
     poses = np.zeros((1, 22, 3))
     poses[0, 0] = [np.pi / 2, 0, 0]
     write_bvh(tmp_path / "clip.bvh", Clip("clip", poses, np.array([[0.5, -2.0, 1.0]]), 60.0), REST)
-    rotations, positions = read_bvh(tmp_path / "clip.bvh").kinematics()
+    rotations, positions = read_bvh(tmp_path / "clip.bvh").compute_kinematics()
     np.testing.assert_allclose(positions[0, 0], [50, 100, 200], atol=1e-5)
     np.testing.assert_allclose(rotations[0], np.broadcast_to(np.eye(3), rotations[0].shape), atol=1e-7)
 
@@ -322,7 +322,7 @@ def test_angles_do_not_jump():
     axis = np.array([1, 0.3, 0.2]) / np.linalg.norm([1, 0.3, 0.2])
     turn = np.radians(np.arange(0, 720, 3) + 0.7)
     matrices = Rotation.from_rotvec(turn[:, None] * axis).as_matrix()
-    angles = euler_zxy(matrices[:, None])[:, 0]
+    angles = compute_euler_zxy(matrices[:, None])[:, 0]
     assert_turns(angles, matrices)
     halfway = Rotation.from_euler("ZXY", (angles[1:] + angles[:-1]) / 2, degrees=True)
     expected = Rotation.from_rotvec((turn[1:] + turn[:-1])[:, None] / 2 * axis)

@@ -9,12 +9,12 @@ import pytest
 import torch
 from glb import Glb
 
-from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats.gltf import UNITY_BONES, mannequin, write_gltf, write_vrm
+from memmlp.motion.formats.gltf import UNITY_BONES, build_mannequin, write_gltf, write_vrm
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 
 
 def moving(frames: int = 40, fps: float = 60.0) -> Clip:
@@ -94,7 +94,7 @@ def test_the_mannequin_moves_with_the_joints(glb: Glb, clip: Clip):
 
 
 def test_the_mannequin_is_seen_from_outside():
-    mesh = mannequin(REST)
+    mesh = build_mannequin(REST)
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-12)
     a, b, c = (mesh.positions[mesh.triangles[:, corner]] for corner in range(3))
     across = np.cross(b - a, c - a)

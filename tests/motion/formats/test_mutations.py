@@ -26,7 +26,7 @@ FORMATS: dict[str, tuple[Callable[[], bytes], Callable[[Path], np.ndarray]]] = {
     "packed.npz": (lambda: sound_npz(packed=True), npz_numbers),
     "a.bvh": (
         lambda: person("cmu_motionbuilder", frames=5, seed=0).text().encode(),
-        lambda path: read_bvh(path).kinematics()[1],
+        lambda path: read_bvh(path).compute_kinematics()[1],
     ),
 }
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, make_builtin_rest_joints
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.anatomy import HINGES, LIMBS
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 ALL = np.ones(len(JOINTS), bool)
 JOINT = {name: index for index, name in enumerate(JOINTS)}
 
@@ -20,8 +20,8 @@ def without(*names: str) -> np.ndarray:
 
 
 def test_segments_go_on_past_joints_that_are_missing() -> None:
-    assert len(anatomy.segments(ALL)) == 17
-    names = [str(segment) for segment in anatomy.segments(without("spine3", "neck", "left_foot"))]
+    assert len(anatomy.list_segments(ALL)) == 17
+    names = [str(segment) for segment in anatomy.list_segments(without("spine3", "neck", "left_foot"))]
     assert "spine2 to head" in names
     assert not [name for name in names if "left_foot" in name]
 
@@ -29,23 +29,25 @@ def test_segments_go_on_past_joints_that_are_missing() -> None:
 def test_angles_are_accurate() -> None:
     for size in (1e-9, 1.0, np.pi - 1e-6):
         turned = Rotation.from_rotvec([0, 0, size]).apply([1.0, 0, 0])
-        assert anatomy.angles(np.array([2.0, 0, 0]), 3 * turned) == pytest.approx(np.degrees(size), rel=1e-6)
+        assert anatomy.compute_angles(np.array([2.0, 0, 0]), 3 * turned) == pytest.approx(
+            np.degrees(size), rel=1e-6
+        )
 
 
 def test_least_rotation_turns_one_direction_onto_another() -> None:
     random = np.random.default_rng(0)
-    a, b = anatomy.unit(random.normal(size=(2, 50, 3)))
-    turn = anatomy.least_rotation(a, b)
+    a, b = anatomy.normalize_vectors(random.normal(size=(2, 50, 3)))
+    turn = anatomy.compute_least_rotation(a, b)
     np.testing.assert_allclose(np.einsum("nij,nj->ni", turn, a), b, atol=1e-12)
     own = np.degrees(Rotation.from_matrix(turn).magnitude())
-    np.testing.assert_allclose(own, anatomy.angles(a, b), atol=1e-9)
-    np.testing.assert_array_equal(anatomy.least_rotation(a[:1] * 0, b[:1]), np.eye(3)[None])
+    np.testing.assert_allclose(own, anatomy.compute_angles(a, b), atol=1e-9)
+    np.testing.assert_array_equal(anatomy.compute_least_rotation(a[:1] * 0, b[:1]), np.eye(3)[None])
 
 
 def test_least_rotation_turns_a_direction_onto_its_opposite() -> None:
     """As a bone lies that a file's zero pose has pointing down, and the body pointing up."""
     ways = np.concatenate([np.eye(3), -np.eye(3), [[1, 1, 1], [0.5, -2, 0]]])
-    turn = anatomy.least_rotation(ways, -3 * ways)
+    turn = anatomy.compute_least_rotation(ways, -3 * ways)
     np.testing.assert_allclose(np.einsum("nij,nj->ni", turn, ways), -ways, atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turn), 1, atol=1e-12)
 
@@ -67,38 +69,38 @@ def turned(joint: str, axis: str, degrees: float) -> np.ndarray:
 
 def test_the_rest_pose_is_a_stance_whichever_way_it_faces() -> None:
     pose = REST @ Rotation.from_euler("y", 90, degrees=True).as_matrix().T
-    assert anatomy.why_no_stance(pose) is None
-    assert anatomy.wrong_sides(pose, ALL) is None
-    np.testing.assert_allclose(pose @ anatomy.facing(pose).T, REST, atol=1e-12)
+    assert anatomy.find_stance_fault(pose) is None
+    assert anatomy.find_side_fault(pose, ALL) is None
+    np.testing.assert_allclose(pose @ anatomy.find_facing_turn(pose).T, REST, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("pose", "said"),
     [
-        (turned("pelvis", "x", 90), "pelvis to head is"),
-        (turned("spine1", "x", 120), "pelvis to head is"),
-        (turned("left_hip", "x", -90), "left_hip to left_knee is"),
-        (turned("right_knee", "x", 90), "right_knee to right_ankle is"),
+        (turned("pelvis", "x", 90), "pelvis to head points"),
+        (turned("spine1", "x", 120), "pelvis to head points"),
+        (turned("left_hip", "x", -90), "left_hip to left_knee points"),
+        (turned("right_knee", "x", 90), "right_knee to right_ankle points"),
         (turned("left_knee", "x", -40), "left_knee bends forward"),
-        (REST * [1, 1, 1] + np.eye(22)[:, [1]] * [0, 0.3, 0], "the line of the hips is"),
+        (REST * [1, 1, 1] + np.eye(22)[:, [1]] * [0, 0.3, 0], "the hip line is"),
         (REST * 0, "at the same place"),
     ],
 )
 def test_what_is_no_stance(pose: np.ndarray, said: str) -> None:
-    assert said in str(anatomy.why_no_stance(pose))
+    assert said in str(anatomy.find_stance_fault(pose))
 
 
 def test_wrong_sides() -> None:
     swapped = REST.copy()
     swapped[[16, 17]] = REST[[17, 16]]
-    assert "the left shoulder" in str(anatomy.wrong_sides(swapped, ALL))
-    assert "the feet point backward" in str(anatomy.wrong_sides(REST * [-1, 1, 1], ALL))
-    assert anatomy.wrong_sides(REST * [-1, 1, 1], without("left_foot", "right_foot")) is None
+    assert "the left shoulder" in str(anatomy.find_side_fault(swapped, ALL))
+    assert "the feet point backward" in str(anatomy.find_side_fault(REST * [-1, 1, 1], ALL))
+    assert anatomy.find_side_fault(REST * [-1, 1, 1], without("left_foot", "right_foot")) is None
 
 
 def test_the_straightest_is_the_least_uneven() -> None:
     poses = np.stack([turned("left_knee", "x", 30), REST, turned("spine1", "z", 20)])
-    assert anatomy.unevenness(poses).argmin() == 1
+    assert anatomy.measure_unevenness(poses).argmin() == 1
 
 
 # Joints in a stance
@@ -109,11 +111,11 @@ def test_every_segment_points_as_in_the_stance(mapped: np.ndarray) -> None:
     stance = turned("left_shoulder", "z", -60)
     stance[JOINT["right_wrist"]] += [0.1, -0.1, 0.05]
     stance[JOINT["left_knee"]] += [0.0, 0.02, 0.06]
-    own = anatomy.orientations(stance, mapped, REST)
-    for start, end in anatomy.segments(mapped):
+    own = anatomy.compute_orientations(stance, mapped, REST)
+    for start, end in anatomy.list_segments(mapped):
         if start > 0:
             there = stance[end] - stance[start]
-            assert anatomy.angles(own[start] @ (REST[end] - REST[start]), there) < 1e-6
+            assert anatomy.compute_angles(own[start] @ (REST[end] - REST[start]), there) < 1e-6
 
 
 def test_bends_and_hinges() -> None:
@@ -126,12 +128,12 @@ def test_bends_and_hinges() -> None:
         straight = REST[middle] - REST[joint]
         positions[:, end] = positions[:, middle] + 0.3 * bends @ straight
         upper = np.tile(np.eye(3), (3, 1, 1))
-        found = anatomy.hinge(upper, positions, joint)
+        found = anatomy.find_hinge_axis(upper, positions, joint)
         assert found is not None
-        seen = anatomy.bend(positions[2], joint)
+        seen = anatomy.find_bend_axis(positions[2], joint)
         assert seen is not None
         for own in (found, seen):
-            assert anatomy.angles(own, np.array(axis)) < 15
+            assert anatomy.compute_angles(own, np.array(axis)) < 15
         positions[:, end] = positions[:, middle] + straight
-        assert anatomy.hinge(upper, positions, joint) is None
-        assert anatomy.bend(positions[2], joint) is None
+        assert anatomy.find_hinge_axis(upper, positions, joint) is None
+        assert anatomy.find_bend_axis(positions[2], joint) is None

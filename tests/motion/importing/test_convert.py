@@ -25,12 +25,12 @@ from bvh_samples import (
 from scipy.spatial.transform import Rotation
 from skeleton_families import walking as walking_sample
 
-from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import Bvh, read_bvh
 from memmlp.motion.formats.recording import END
-from memmlp.motion.geometry import clip_kinematics
-from memmlp.motion.importing.anatomy import segments
+from memmlp.motion.geometry import compute_clip_kinematics
+from memmlp.motion.importing.anatomy import list_segments
 from memmlp.motion.importing.convert import (
     JUMP,
     NONE,
@@ -38,18 +38,18 @@ from memmlp.motion.importing.convert import (
     UNITS,
     Conversion,
     Stance,
-    convert,
+    convert_recording,
     find_floor,
     find_stance,
     find_unit_and_up,
-    first_step,
-    fit,
+    fit_skeleton,
+    measure_first_step,
     view_stance,
 )
 from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap, find_skeleton, load_skeleton, pick_joints
 from memmlp.motion.synthetic import synthesize_clip
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 JOINT = {name: index for index, name in enumerate(JOINTS)}
 DATA = Path(__file__).parents[3] / ".." / "shared" / "data"
 CMU = [DATA / "cmu" / name for name in ("salsa/15.bvh", "indian/04.bvh", "martial/03.bvh")]
@@ -59,10 +59,10 @@ MM, DEGREES = 1.0, 3.0  # the largest errors that an import may have
 
 def check(path: Path, chosen: SkeletonMap) -> Conversion:
     """Import a file; the clip must be as in the file."""
-    converted = convert(read_bvh(path), chosen, REST, name=path.stem, fps=120.0)
+    converted = convert_recording(read_bvh(path), chosen, REST, name=path.stem, fps=120.0)
     assert converted.fidelity.mm.value < MM
     assert converted.fidelity.degrees.value < DEGREES
-    assert [fault for fault in converted.fidelity.faults if "a jump, or a cut" not in fault] == []
+    assert [fault for fault in converted.fidelity.faults if "a jump or a cut" not in fault] == []
     return converted
 
 
@@ -77,7 +77,7 @@ def test_cmu_as_in_the_file(tmp_path: Path, path: Path) -> None:
     copy = write(tmp_path, path.read_bytes())
     chosen = find_skeleton(read_bvh(copy))
     faults = check(copy, chosen).fidelity.faults
-    assert ["from frame 732 to the next" in fault for fault in faults] == [True] * (path.stem == "15")
+    assert ["after frame 732" in fault for fault in faults] == [True] * (path.stem == "15")
 
 
 @pytest.mark.slow
@@ -210,9 +210,9 @@ def test_no_floor_without_contact() -> None:
 
 def test_a_t_pose_before_the_motion_is_a_far_step_and_motion_is_none():
     sample = performed(load_skeleton("cmu_daz"), synthesize_clip("waving", 1, seconds=2.0))
-    assert first_step(sample.hierarchy()) > JUMP
-    assert first_step(replace(sample, values=sample.values[:3]).hierarchy()) == 0.0
-    assert first_step(replace(sample, values=sample.values[1:]).hierarchy()) < JUMP
+    assert measure_first_step(sample.hierarchy()) > JUMP
+    assert measure_first_step(replace(sample, values=sample.values[:3]).hierarchy()) == 0.0
+    assert measure_first_step(replace(sample, values=sample.values[1:]).hierarchy()) < JUMP
 
 
 # The stance that is shown: the one that importing reads, with all nodes, and the body in it
@@ -238,7 +238,7 @@ def test_the_body_stands_as_the_file_does(tmp_path: Path, name: str, turned: boo
 
 def to_clip(bvh: Bvh, chosen: SkeletonMap, rest: np.ndarray = REST) -> Clip:
     """The clip, its floor as in the file."""
-    return convert(bvh, chosen, rest, name="clip", fps=120.0, floor=NONE).clip
+    return convert_recording(bvh, chosen, rest, name="clip", fps=120.0, floor=NONE).clip
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -256,13 +256,13 @@ def to_z_up(vectors: np.ndarray) -> np.ndarray:
 def test_segments_point_as_in_the_file(tmp_path: Path, skeleton: str) -> None:
     """Exactly, and though the unmapped joints between mapped ones turn too."""
     bvh, chosen = read(tmp_path, skeleton, folded=True), load_skeleton(skeleton)
-    positions = to_z_up(bvh.kinematics()[1])[1:]
-    body = clip_kinematics(to_clip(bvh, chosen), REST)[1]
+    positions = to_z_up(bvh.compute_kinematics()[1])[1:]
+    body = compute_clip_kinematics(to_clip(bvh, chosen), REST)[1]
     mapped = np.array([name in chosen.joints for name in JOINTS])
-    pairs = [segment for segment in segments(mapped) if segment.start > 0]
+    pairs = [segment for segment in list_segments(mapped) if segment.start > 0]
     for joint, child in (*pairs, (JOINT["right_hip"], JOINT["left_hip"])):
         start, end = (bvh.nodes.index(chosen.joints[JOINTS[index]]) for index in (joint, child))
-        if np.linalg.norm(bvh.zero_pose()[end] - bvh.zero_pose()[start]) < 1e-6:
+        if np.linalg.norm(bvh.compute_zero_pose()[end] - bvh.compute_zero_pose()[start]) < 1e-6:
             continue
         expected = unit(positions[:, end] - positions[:, start])
         np.testing.assert_allclose(unit(body[:, child] - body[:, joint]), expected, atol=1e-9)
@@ -276,10 +276,12 @@ def test_a_standing_person_stands(tmp_path: Path) -> None:
     sample = person("cmu_daz", 2, 0)
     sample.values[:] = 0
     bvh, chosen = read_bvh(write(tmp_path, sample.text())), load_skeleton("cmu_daz")
-    toes = bvh.zero_pose()[[bvh.nodes.index(chosen.joints[foot]) for foot in ("left_foot", "right_foot")], 1]
+    toes = bvh.compute_zero_pose()[
+        [bvh.nodes.index(chosen.joints[foot]) for foot in ("left_foot", "right_foot")], 1
+    ]
     sample.values[:, 1] = -toes.mean()
     clip = to_clip(read_bvh(write(tmp_path, sample.text())), chosen)
-    at = dict(zip(JOINTS, clip_kinematics(clip, REST)[1][0], strict=True))
+    at = dict(zip(JOINTS, compute_clip_kinematics(clip, REST)[1][0], strict=True))
     assert 1.3 < at["head"][2] < 1.7
     assert 0.7 < at["pelvis"][2] - at["left_ankle"][2] < 1.0
     assert abs(at["left_foot"][2]) < 0.06
@@ -325,7 +327,7 @@ def test_a_performance_comes_back_from_its_file(tmp_path: Path) -> None:
         load_skeleton("cmu_daz"),
         tree("cmu_daz"),
     )
-    corrections = fit(zero_pose(sample), chosen, REST).corrections
+    corrections = fit_skeleton(compute_zero_pose(sample), chosen, REST).corrections
     file = performed(chosen, clip, sample=sample, corrections=corrections)
     bvh = read_bvh(write(tmp_path, file.text("\r\n")))
     found = to_clip(bvh, find_skeleton(bvh))
@@ -336,7 +338,7 @@ def test_a_performance_comes_back_from_its_file(tmp_path: Path) -> None:
     assert np.degrees(angles.max()) < 0.01
 
 
-def zero_pose(sample: Sample) -> Bvh:
+def compute_zero_pose(sample: Sample) -> Bvh:
     return replace(sample, values=np.zeros((2, sample.values.shape[1]))).hierarchy()
 
 
@@ -375,15 +377,15 @@ def test_a_zero_pose_serves_if_it_stands(tmp_path: Path, walk: Clip) -> None:
 
 def test_who_never_stands_is_refused(tmp_path: Path, walk: Clip) -> None:
     turns = random_turns(own_tree(DAZ), 1)
-    with refuse(tmp_path / "clip.bvh", "stands neither in the zero pose (", "nor in any frame (at best, "):
+    with refuse(tmp_path / "clip.bvh", "stands neither in the zero pose (", "nor in a frame (best: "):
         found(tmp_path, lying(walk, "z"), DAZ, turns=turns)
     assert found(tmp_path, lying(walk, "z"), DAZ).source == "the zero pose"
 
 
 def test_a_wrong_up_axis_is_refused(tmp_path: Path, walk: Clip) -> None:
-    with refuse(tmp_path / "clip.bvh", "degrees from up"):
+    with refuse(tmp_path / "clip.bvh", "degrees away from up"):
         found(tmp_path, walk, replace(DAZ, up="z"))
-    with refuse(tmp_path / "clip.bvh", "degrees from up"):
+    with refuse(tmp_path / "clip.bvh", "degrees away from up"):
         found(tmp_path, walk, DAZ, written=replace(DAZ, up="z"))
 
 
@@ -409,7 +411,7 @@ def test_swapped_sides_are_refused(tmp_path: Path, walk: Clip) -> None:
         with refuse(tmp_path / "clip.bvh", said):
             found(tmp_path, walk, swapped(DAZ, parts))
     turns = random_turns(own_tree(DAZ), 1)
-    with refuse(tmp_path / "clip.bvh", "bends forward: left and right"):
+    with refuse(tmp_path / "clip.bvh", "bends forward, so left and right"):
         found(tmp_path, walk, swapped(DAZ, LEG), turns=turns)
 
 
@@ -427,8 +429,8 @@ def leaning(degrees: float) -> list[float]:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"Spine": leaning(80.0)}, "pelvis to head is 7"),
-        ({"Hips": [0.0, 0.0, 0.0]}, "rest of skeleton bandai_namco"),
+        ({"Spine": leaning(80.0)}, "pelvis to head points 7"),
+        ({"Hips": [0.0, 0.0, 0.0]}, "rest in skeleton bandai_namco"),
         ({"Foot_R": [-0.6, 186.9, -65.9], "Foot_L": [-0.6, 186.9, -65.9]}, "the feet point backward"),
         ({"Spine": [90.0, 86.2]}, "rest.Spine has 2 values"),
     ],

@@ -9,7 +9,13 @@ from bvh_samples import refuse, write
 from skeleton_families import joints, renamed, walking
 
 from memmlp.motion.formats.bvh import Bvh, read_bvh
-from memmlp.motion.importing.guess import as_yaml, check, guess, split_words, write_map
+from memmlp.motion.importing.guess import (
+    convert_with_guess,
+    format_yaml,
+    guess_map,
+    split_node_name,
+    write_map,
+)
 from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
 
 
@@ -29,15 +35,15 @@ def test_words():
         ("rclavicle", "right", "clavicle"), ("leftupleg", "left", "upleg"), ("lowerback", "", "lowerback"),
         ("RightHandThumb1", "right", "handthumb1"), ("LeftRight", "", "leftright"),
     ):  # fmt: skip
-        assert split_words(name) == (side, word)
+        assert split_node_name(name) == (side, word)
 
 
 def test_the_shipped_map_is_guessed_and_written(tmp_path: Path, name: str):
     bvh = walks(tmp_path, name)
-    proposed = guess(bvh, "on: 1")
+    proposed = guess_map(bvh, "on: 1")
     assert proposed.skeleton.joints == load_skeleton(name).joints
     assert not proposed.missing
-    write_map(tmp_path / "mine.yaml", as_yaml(proposed, bvh))
+    write_map(tmp_path / "mine.yaml", format_yaml(proposed, bvh))
     loaded = load_skeleton(str(tmp_path / "mine.yaml"))
     assert (loaded.name, loaded.joints) == ("on: 1", proposed.skeleton.joints)
     assert loaded.calibration_frame == proposed.skeleton.calibration_frame == name.startswith("cmu_")
@@ -67,14 +73,14 @@ VRM = {  # humanoid bones of VRM files
 @pytest.mark.parametrize(("family", "names"), [("cmu_motionbuilder", HDM), ("lafan1", VRM)])
 def test_names_of_other_programs_are_known(tmp_path: Path, family: str, names: dict[str, str]):
     bvh = renamed(walks(tmp_path, family), names)
-    proposed = guess(bvh, "mine")
+    proposed = guess_map(bvh, "mine")
     expected = {joint: names[node] for joint, node in load_skeleton(family).joints.items()}
     assert proposed.skeleton.joints == expected
 
 
 def test_a_proposed_map_imports(tmp_path: Path):
     bvh = walks(tmp_path, "lafan1", turned=True)
-    done = check(bvh, guess(bvh, "mine"))
+    done = convert_with_guess(bvh, guess_map(bvh, "mine"))
     assert "straightest" in done.fitted.stance.source
     assert done.fidelity.faults == ()
 
@@ -83,13 +89,13 @@ def test_a_joint_without_a_known_name_is_left_to_the_user(tmp_path: Path):
     bvh = walks(tmp_path, "lafan1")
     names = {joint: joint for joint in joints(bvh)} | {"LeftForeArm": "bone7"}
     bvh = renamed(bvh, names)
-    proposed = guess(bvh, "mine")
+    proposed = guess_map(bvh, "mine")
     assert proposed.missing == ("left_elbow",)
-    assert "# left_elbow is required" in as_yaml(proposed, bvh)
+    assert "# left_elbow is required" in format_yaml(proposed, bvh)
     with refuse("joints.left_elbow"):
-        check(bvh, proposed)
+        convert_with_guess(bvh, proposed)
     nothing = renamed(bvh, {joint: f"bone{number}" for number, joint in enumerate(joints(bvh))})
-    assert "left_hip" in guess(nothing, "mine").missing
+    assert "left_hip" in guess_map(nothing, "mine").missing
 
 
 def test_an_existing_map_is_not_replaced(tmp_path: Path):

@@ -13,18 +13,18 @@ from bvh_samples import own_tree, performed, person, random_turns, refuse, tree,
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import JOINTS, builtin_rest_joints
-from memmlp.motion.clip import Skipped
+from memmlp.motion.body import JOINTS, make_builtin_rest_joints
+from memmlp.motion.clip import SkippedFile
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.geometry import clip_kinematics
-from memmlp.motion.importing.convert import NONE, convert
+from memmlp.motion.geometry import compute_clip_kinematics
+from memmlp.motion.importing.convert import NONE, convert_recording
 from memmlp.motion.importing.fidelity import Fidelity
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder, verify_folder
 from memmlp.motion.importing.skeleton_map import SKELETONS, find_skeleton, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
-REST = builtin_rest_joints()
+REST = make_builtin_rest_joints()
 
 
 def verify(path: Path, **how: str) -> Fidelity:
@@ -60,14 +60,14 @@ def test_import_writes_clips_and_record(source: Path, tmp_path: Path) -> None:
         "salsa/02.bvh",
         "top.bvh",
     ]
-    assert report.notes == ("salsa: 60 Hz, given for salsa; the header says 120 Hz (01.bvh, 02.bvh)",)
+    assert report.notes == ("salsa: 60 Hz, set for salsa; the header has 120 Hz (01.bvh, 02.bvh)",)
     record = json.loads((out / "import.json").read_text())
     assert [clip["clip"] for clip in record["clips"]] == sorted(rates(out))
     assert record["clips"][3]["sha256"] == hashlib.sha256((source / "top.bvh").read_bytes()).hexdigest()
     assert str(tmp_path) not in (out / "import.json").read_text()
     assert not [path for path in tmp_path.iterdir() if path.name not in ("source", "out")]
     bvh = read_bvh(source / "salsa/02.bvh")
-    expected = convert(bvh, find_skeleton(bvh), REST, name="clip", fps=60.0).clip
+    expected = convert_recording(bvh, find_skeleton(bvh), REST, name="clip", fps=60.0).clip
     clip = read_clip(out / "salsa/02.npz", "salsa/02")
     np.testing.assert_array_equal(clip.poses.astype(np.float32), expected.poses.astype(np.float32))
 
@@ -88,7 +88,7 @@ def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
     write(source, "HIERARCHY", "salsa/01.bvh")
     report = import_folder(source, tmp_path / "out")
     assert [skipped.file for skipped in report.skipped] == ["salsa/01.bvh"]
-    assert report.skipped[0].reason.startswith("no MOTION")
+    assert report.skipped[0].reason.startswith("has no MOTION")
     assert list(rates(tmp_path / "out")) == ["indian/01.npz", "salsa/02.npz", "top.npz"]
     assert str(tmp_path) not in (tmp_path / "out" / "import.json").read_text()
 
@@ -169,7 +169,9 @@ def toes(out: Path) -> dict[str, float]:
     """The lower toe's tenth percentile of each clip, metres."""
     feet = [JOINTS.index("left_foot"), JOINTS.index("right_foot")]
     return {
-        path.stem: float(np.percentile(clip_kinematics(read_clip(path, ""), REST)[1][:, feet, 2].min(1), 10))
+        path.stem: float(
+            np.percentile(compute_clip_kinematics(read_clip(path, ""), REST)[1][:, feet, 2].min(1), 10)
+        )
         for path in sorted(out.rglob("*.npz"))
     }
 
@@ -177,7 +179,7 @@ def toes(out: Path) -> dict[str, float]:
 def test_each_clip_is_put_on_its_floor(walks: Path, tmp_path: Path) -> None:
     write(walks, person("cmu_daz", 9, 9).text(), "flying.bvh")
     report = import_folder(walks, tmp_path / "out")
-    assert report.notes == ("flying.bvh: no foot stands still, so the floor is as in the file",)
+    assert report.notes == ("flying.bvh: no foot stands still, so the floor height was not corrected",)
     (tmp_path / "out" / "flying.npz").unlink()
     assert max(abs(height - 0.02) for height in toes(tmp_path / "out").values()) < 0.01
     assert report.clips[-1].floor is None
@@ -214,7 +216,11 @@ def test_several_up_axes_and_stances_of_one_skeleton_are_noted(tmp_path: Path) -
         text = performed(replace(chosen, up=up), walk, turns=turns).text()
         write(tmp_path / "source", text, f"{name}.bvh")
     notes = import_folder(tmp_path / "source", tmp_path / "out", ImportSettings(skeleton=str(path))).notes
-    assert [note for note in notes if note.startswith("cmu_daz: up is found as y in 2 clips, z in 1 clips")]
+    assert [
+        note
+        for note in notes
+        if note.startswith("cmu_daz: up differs between clips: y in 2 clips, z in 1 clips")
+    ]
     assert [note for note in notes if note.startswith("cmu_daz: the zero pose of 3 clips")]
 
 
@@ -226,7 +232,7 @@ def test_who_lies_is_imported_lying_where_up_is_told(tmp_path: Path) -> None:
     with refuse(tmp_path / "clip.bvh", "stands along y in the zero pose, but along z in the motion"):
         import_folder(tmp_path / "clip.bvh", tmp_path / "out")
     import_folder(tmp_path / "clip.bvh", tmp_path / "out", ImportSettings(up="y"))
-    places = clip_kinematics(read_clip(tmp_path / "out" / "clip.npz", "clip"), REST)[1]
+    places = compute_clip_kinematics(read_clip(tmp_path / "out" / "clip.npz", "clip"), REST)[1]
     assert np.abs(places[:, 15, 2] - places[:, 0, 2]).max() < 0.2  # the head is as high as the pelvis
     assert verify(tmp_path / "clip.bvh", up="y").mm.value < 1
 
@@ -240,7 +246,7 @@ def test_clips_with_faults_are_left_out_where_only_sound_ones_are_wanted(tmp_pat
     report = import_folder(tmp_path / "in", tmp_path / "out", settings)
     assert [clip.clip for clip in report.clips] == ["sound.npz"]
     assert report.skipped[0].file == "sliding.bvh"
-    assert "none stands still" in report.skipped[0].reason
+    assert "no joint stands still" in report.skipped[0].reason
     assert not (tmp_path / "out" / "sliding.npz").exists()
     with refuse(tmp_path / "in" / "sliding.bvh", "--sound"):
         import_folder(tmp_path / "in", tmp_path / "strict", replace(settings, strict=True))
@@ -268,6 +274,6 @@ def test_verify_goes_on_past_bad_files(tmp_path: Path) -> None:
     write(tmp_path, "HIERARCHY", "b.bvh")
     found = list(verify_folder(tmp_path, ImportSettings("cmu_daz")))
     assert [getattr(row, "name", "") or row.file for row in found] == ["a.bvh", "b.bvh", "c/1.bvh"]
-    assert [type(row) for row in found] == [Fidelity, Skipped, Fidelity]
-    assert isinstance(found[1], Skipped)
-    assert found[1].reason.startswith("no MOTION")
+    assert [type(row) for row in found] == [Fidelity, SkippedFile, Fidelity]
+    assert isinstance(found[1], SkippedFile)
+    assert found[1].reason.startswith("has no MOTION")

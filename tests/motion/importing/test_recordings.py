@@ -23,9 +23,9 @@ def test_the_header_is_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     digest = hashlib.sha256(path.read_bytes().replace(b"\r\n", b"\n")).hexdigest()[:DIGITS]
     known = "memmlp.motion.importing.recordings._load_known_rates"
     monkeypatch.setattr(known, lambda: {digest: 60.0})
-    assert find_rate(recording, relative, {}) == (60, "known of this file")
-    assert find_rate(recording, relative, {"": 40}) == (40, "given for all")
-    assert find_rate(recording, relative, {"dance": 30, "": 40}) == (30, "given for dance")
+    assert find_rate(recording, relative, {}) == (60, "the known true rate of this file")
+    assert find_rate(recording, relative, {"": 40}) == (40, "set for all")
+    assert find_rate(recording, relative, {"dance": 30, "": 40}) == (30, "set for dance")
     monkeypatch.setattr(known, dict)
     assert find_rate(replace(recording, fps=None), relative, {}).fps == 120  # an AMC's
     assert find_rate(replace(recording, fps=None), relative, {"": 60}).fps == 60
@@ -35,7 +35,7 @@ def test_the_header_is_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_cmus_salsa_is_known() -> None:
     paths = sorted(SALSA.glob("*.bvh"))[::10]
     found = {find_rate(read_bvh(path), Path(path.name), {}) for path in paths}
-    assert found == {(60, "known of this file")}
+    assert found == {(60, "the known true rate of this file")}
 
 
 def test_other_files_are_passed_over(tmp_path: Path) -> None:

@@ -19,10 +19,10 @@ from memmlp.motion.importing.skeleton_map import (
     SKELETONS,
     find_nodes,
     find_skeleton,
+    list_shipped_skeletons,
     load_skeleton,
     pick_joints,
-    shipped_skeletons,
-    without_namespace,
+    strip_namespace,
 )
 
 
@@ -92,7 +92,7 @@ def test_what_a_map_leaves_out_is_found(tmp_path: Path) -> None:
 def test_joints_are_those_of_the_map(tmp_path: Path, skeleton: str) -> None:
     bvh, chosen = read(tmp_path, skeleton), load_skeleton(skeleton)
     mapped_motion = pick_joints(bvh, chosen)
-    positions = bvh.kinematics()[1][1:] * chosen.unit
+    positions = bvh.compute_kinematics()[1][1:] * chosen.unit
     assert len(mapped_motion) == len(bvh) - 1
     for joint, name in enumerate(JOINTS):
         assert mapped_motion.mapped[joint] == (name in chosen.joints)
@@ -124,7 +124,7 @@ def test_namespaces_are_left_out():
         (["a:Hips", "b:Hips"], ["a:Hips", "b:Hips"]),
         (["joint_1", "joint_2", "joint_2.end"], ["1", "2", "2.end"]),
     ):
-        assert without_namespace(nodes) == plain
+        assert strip_namespace(nodes) == plain
 
 
 def test_nodes_are_found_by_their_very_name_first():
@@ -135,7 +135,7 @@ def test_nodes_are_found_by_their_very_name_first():
     assert find_nodes(nodes, ["Tail"]) is None
 
 
-@pytest.mark.parametrize("name", shipped_skeletons())
+@pytest.mark.parametrize("name", list_shipped_skeletons())
 def test_each_familys_file_is_known_by_its_own_map(name: str):
     prefix = "mixamorig:"
     bvh = family(name).hierarchy()

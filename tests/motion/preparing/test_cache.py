@@ -13,14 +13,14 @@ import torch
 from processes import forked
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import RECORD, body_record, builtin_rest_joints
+from memmlp.motion.body import RECORD, describe_body, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.formats.npz import read_clip, write_clip
-from memmlp.motion.geometry import motion_frames
+from memmlp.motion.geometry import compute_motion_frames
 from memmlp.motion.preparing import cache as module
 from memmlp.motion.preparing import survey as survey_module
-from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import SeededSplit
 from memmlp.runs.identity import VERSIONS
@@ -46,78 +46,80 @@ def source(root: Path, **changes) -> ClipFolder:
 
 
 def test_the_cache_holds_the_clips_frames(root, tmp_path):
-    manifest = prepare(source(root), tmp_path / "cache")
+    manifest = prepare_cache(source(root), tmp_path / "cache")
     assert manifest == Manifest.load(tmp_path / "cache")
     assert {name: total.clips for name, total in manifest.totals.items()} == {"train": 6, "val": 2, "test": 2}
-    rest = torch.tensor(builtin_rest_joints())
+    rest = torch.tensor(make_builtin_rest_joints())
     for record in manifest.clips:
         seed = int(record.name.split("/")[1])
         clip = motion(60 + seed, seed)
         step = 2 if seed == 3 else 1
         assert record.resampling == ("every 2. frame" if seed == 3 else "kept")
         poses, trans = (x[::step].astype(np.float32).astype(np.float64) for x in (clip.poses, clip.trans))
-        expected = motion_frames(torch.tensor(poses), torch.tensor(trans), rest).float()
+        expected = compute_motion_frames(torch.tensor(poses), torch.tensor(trans), rest).float()
         split = MotionDataset.open(tmp_path / "cache", record.split)
-        torch.testing.assert_close(split.clip(split.names.index(record.name)), expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            split.read_clip(split.names.index(record.name)), expected, atol=1e-5, rtol=0
+        )
 
 
 def test_bad_files_are_skipped_with_a_reason_or_stop(root, tmp_path):
     (root / "a" / "broken.npz").write_bytes(b"PK broken")
     write_clip(root / "a" / "short.npz", motion(5, 99))
     np.savez(root / "a" / "shape.npz", betas=np.zeros(16))
-    manifest = prepare(source(root), tmp_path / "cache")
+    manifest = prepare_cache(source(root), tmp_path / "cache")
     assert {Path(file.file).name for file in manifest.skipped} == {"broken.npz", "short.npz"}
     assert all(file.reason and "\n" not in file.reason for file in manifest.skipped)
     assert len(manifest.clips) == 10
     with pytest.raises(InputError, match="npz"):
-        prepare(source(root, strict=True), tmp_path / "strict")
+        prepare_cache(source(root, strict=True), tmp_path / "strict")
     assert not (tmp_path / "strict" / "manifest.json").exists()
 
 
 def test_unchanged_sources_are_not_read_again(root, tmp_path, monkeypatch):
-    first = prepare(source(root), tmp_path / "cache")
+    first = prepare_cache(source(root), tmp_path / "cache")
 
     def no_reading(*args):
         raise AssertionError("read a clip")
 
     with monkeypatch.context() as patch:
         patch.setattr(survey_module, "read_clip", no_reading)
-        assert prepare(source(root), tmp_path / "cache") == first
+        assert prepare_cache(source(root), tmp_path / "cache") == first
     write_clip(root / "a" / "3.npz", motion(90, 77))
-    assert prepare(source(root), tmp_path / "cache").digest != first.digest
+    assert prepare_cache(source(root), tmp_path / "cache").digest != first.digest
 
 
 def test_other_clips_of_the_same_sizes_and_times_are_read(root, tmp_path):
     """As from an archive that sets every file's time."""
-    before = prepare(source(root), tmp_path / "cache")
+    before = prepare_cache(source(root), tmp_path / "cache")
     path = next(root.rglob("*.npz"))
     stat = path.stat()
     clip = read_clip(path, "a")
     write_clip(path, replace(clip, poses=clip.poses[::-1].copy()))
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     assert path.stat().st_size == stat.st_size
-    assert prepare(source(root), tmp_path / "cache").digest != before.digest
+    assert prepare_cache(source(root), tmp_path / "cache").digest != before.digest
 
 
 def test_the_digest_knows_every_ingredient(root, tmp_path):
-    base = prepare(source(root), tmp_path / "0").digest
+    base = prepare_cache(source(root), tmp_path / "0").digest
     copy = tmp_path / "elsewhere"
     shutil.copytree(root, copy)
-    assert prepare(source(copy), tmp_path / "1").digest == base
-    body = builtin_rest_joints() * 1.1
+    assert prepare_cache(source(copy), tmp_path / "1").digest == base
+    body = make_builtin_rest_joints() * 1.1
     model = tmp_path / "model.npz"
     parents = np.array([[-1, *module.load_rest_joints.__globals__["PARENTS"][1:]], range(22)])
     np.savez(model, J_regressor=np.eye(22), v_template=body, kintree_table=parents)
     others = [source(root, split=SeededSplit(test=0.2, val=0.2, seed=1)), source(root, body=str(model))]
-    digests = {prepare(other, tmp_path / f"x{i}").digest for i, other in enumerate(others)}
+    digests = {prepare_cache(other, tmp_path / f"x{i}").digest for i, other in enumerate(others)}
     (root / "a" / "9.npz").unlink()
-    digests.add(prepare(source(root), tmp_path / "y").digest)
+    digests.add(prepare_cache(source(root), tmp_path / "y").digest)
     assert len(digests | {base}) == 4
 
 
 def test_how_frames_are_interpolated_counts_where_some_are(root, tmp_path):
     def prepared(name: str, interpolation: str) -> tuple[str, np.ndarray]:
-        manifest = prepare(source(root, interpolation=interpolation), tmp_path / name)
+        manifest = prepare_cache(source(root, interpolation=interpolation), tmp_path / name)
         assert manifest.interpolation == interpolation
         return manifest.digest, np.load(tmp_path / name / "train.npy")
 
@@ -135,14 +137,14 @@ def test_an_interrupted_prepare_is_redone(root, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Manifest, "write", lambda *args: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            prepare(source(root), tmp_path / "cache")
+            prepare_cache(source(root), tmp_path / "cache")
     with pytest.raises(InputError):
         Manifest.load(tmp_path / "cache")
-    assert len(prepare(source(root), tmp_path / "cache").clips) == 10
+    assert len(prepare_cache(source(root), tmp_path / "cache").clips) == 10
 
 
 def _digest(root: Path, cache: Path, said: Path) -> None:
-    said.write_text(prepare(source(root), cache).digest)
+    said.write_text(prepare_cache(source(root), cache).digest)
 
 
 @pytest.mark.slow
@@ -159,49 +161,49 @@ def test_two_processes_at_once(root, tmp_path):
 def test_every_clip_knows_its_group(root, tmp_path):
     """Ties are transitive: 1, 2 and 3 are one group through two patterns, and named after its first clip."""
     tied = SeededSplit(test=0.2, val=0.2, groups=["a/[12]$", "a/[23]$"])
-    manifest = prepare(source(root, split=tied), tmp_path / "cache")
+    manifest = prepare_cache(source(root, split=tied), tmp_path / "cache")
     expected = {f"a/{n}": "a/1" if n in (1, 2, 3) else f"a/{n}" for n in range(10)}
     assert manifest.groups == expected
     assert Manifest.load(tmp_path / "cache").groups == expected
     for part in ("train", "val", "test"):
         frames = MotionDataset.open(tmp_path / "cache", part).to("cpu")
         assert frames.groups == [expected[name] for name in frames.names]
-    alone = prepare(source(root), tmp_path / "alone")
+    alone = prepare_cache(source(root), tmp_path / "alone")
     assert alone.groups == {name: name for name in expected}
 
 
 def test_other_groups_change_the_cache_but_not_its_digest(root, tmp_path):
     splits = SeededSplit(test=0, val=0), SeededSplit(test=0, val=0, groups=["a/[12]$"])
-    first, second = (prepare(source(root, split=split), tmp_path / "cache") for split in splits)
+    first, second = (prepare_cache(source(root, split=split), tmp_path / "cache") for split in splits)
     assert first.digest == second.digest
     assert (first.groups["a/2"], second.groups["a/2"]) == ("a/2", "a/1")
 
 
 def test_frames_of_an_older_component_version_are_made_again(root, tmp_path, monkeypatch):
-    first = prepare(source(root), tmp_path / "cache")
+    first = prepare_cache(source(root), tmp_path / "cache")
     made = (tmp_path / "cache" / "train.npy").stat().st_mtime_ns
-    prepare(source(root), tmp_path / "cache")
+    prepare_cache(source(root), tmp_path / "cache")
     assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns == made
     monkeypatch.setitem(VERSIONS, "features", VERSIONS["features"] + 1)
-    again = prepare(source(root), tmp_path / "cache")
+    again = prepare_cache(source(root), tmp_path / "cache")
     assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns > made
     assert again.digest == first.digest
 
 
 def test_clips_are_prepared_on_the_body_of_their_import(root, tmp_path):
     for folder in (root.parent, root / "a"):
-        record = body_record("model.npz", 1.1 * builtin_rest_joints())
+        record = describe_body("model.npz", 1.1 * make_builtin_rest_joints())
         (folder / RECORD).write_text(json.dumps(record))
         with pytest.raises(InputError, match=r"model\.npz.*data\.body"):
-            prepare(source(root), tmp_path / "cache")
+            prepare_cache(source(root), tmp_path / "cache")
         (folder / RECORD).unlink()
 
 
 def test_a_cache_of_another_format_is_made_again(root, tmp_path):
     path = tmp_path / "cache" / "manifest.json"
-    first = prepare(source(root), tmp_path / "cache")
+    first = prepare_cache(source(root), tmp_path / "cache")
     path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 1}))
     with pytest.raises(InputError, match="format 1"):
         Manifest.load(tmp_path / "cache")
-    assert prepare(source(root), tmp_path / "cache") == first
+    assert prepare_cache(source(root), tmp_path / "cache") == first
     assert str(tmp_path) not in path.read_text()

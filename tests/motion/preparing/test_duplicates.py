@@ -17,17 +17,17 @@ from memmlp.motion.body import SWAPPED
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing import survey as survey_module
-from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
 from memmlp.motion.preparing.duplicates import (
     REACH,
     assign_parts,
-    keep_one_part,
+    drop_copies_across_parts,
     mark_frames,
     merge_groups,
 )
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 from memmlp.motion.preparing.splits import Assignment, ListSplit, MixedSplit, SeededSplit
-from memmlp.motion.preparing.survey import survey
+from memmlp.motion.preparing.survey import survey_folder
 from memmlp.motion.synthetic import synthesize_clip
 
 CONTENTS = {"a": "x", "b": "y", "c": "x", "d": "x", "e": "y", "f": "z", "g": STILL, "h": STILL}
@@ -40,11 +40,11 @@ def records(contents: dict[str, str]) -> list[ClipRecord]:
 
 def test_training_gives_way_to_validation_and_both_to_testing():
     parts = {"a": "train", "b": "val", "c": "test", "d": "val", "e": "train", "f": "train"}
-    kept, gave_way = keep_one_part(records(CONTENTS), parts | {"g": "train", "h": "test"})
+    kept, gave_way = drop_copies_across_parts(records(CONTENTS), parts | {"g": "train", "h": "test"})
     assert kept == parts | {"a": None, "d": None, "e": None, "g": "train", "h": "test"}
     assert gave_way == {"a": "c", "d": "c", "e": "b"}
     one = dict.fromkeys(CONTENTS, "train") | {"c": None}
-    assert keep_one_part(records(CONTENTS), one) == (one, {})
+    assert drop_copies_across_parts(records(CONTENTS), one) == (one, {})
 
 
 def test_groups_with_copies_are_merged():
@@ -133,7 +133,7 @@ def test_a_copy_at_another_rate_is_found(
     for activity in ACTIVITIES:
         again = resample(recorded(activity, fps=120.0), fps)[0]
         write_clip(root / "b" / f"{activity}_again.npz", change(again))
-    found = survey(root)
+    found = survey_folder(root)
     assert found.duplicates == {f"b/{activity}_again": f"a/{activity}" for activity in ACTIVITIES}
     assert len(found.clips) == 2 * len(ACTIVITIES)
 
@@ -143,8 +143,8 @@ def test_copies_of_copies_are_one(root: Path):
         write_clip(root / "b" / f"{fps:g}.npz", resample(recorded("walking", fps=120.0), fps)[0])
     write_clip(root / "a" / "walking.npz", recorded("walking", fps=120.0))
     write_clip(root / "c.npz", recorded("walking", fps=120.0))
-    assert set(survey(root).duplicates.values()) == {"a/walking"}
-    assert len(survey(root).duplicates) == 4
+    assert set(survey_folder(root).duplicates.values()) == {"a/walking"}
+    assert len(survey_folder(root).duplicates) == 4
 
 
 def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypatch: pytest.MonkeyPatch):
@@ -155,7 +155,7 @@ def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypa
     write_clip(root / "b" / "part.npz", cut(clip, 0, 60))
     slope = np.linspace(0, 0.1, len(clip))[:, None] * [1, 0, 0]
     write_clip(root / "b" / "drifts.npz", replace(clip, trans=clip.trans + slope))
-    assert survey(root).duplicates == {}
+    assert survey_folder(root).duplicates == {}
 
 
 def backwards(clip: Clip) -> Clip:
@@ -169,7 +169,7 @@ def backwards(clip: Clip) -> Clip:
 def test_a_clip_that_shares_a_stretch_is_found(root: Path, change: Callable[[Clip], Clip]):
     for activity in ACTIVITIES:
         write_clip(root / "b" / f"{activity}.npz", change(recorded(activity)))
-    assert survey(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
+    assert survey_folder(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
 
 
 def test_frames_between_those_of_another_clip_are_a_copy(root: Path):
@@ -177,7 +177,7 @@ def test_frames_between_those_of_another_clip_are_a_copy(root: Path):
         twice = resample(recorded(activity), 120.0)[0]
         odd = replace(twice, poses=twice.poses[1::2], trans=twice.trans[1::2], fps=60.0)
         write_clip(root / "b" / f"{activity}.npz", odd)
-    assert survey(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
+    assert survey_folder(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
 
 
 def test_overlapping_windows_of_a_recording_are_one_group(root: Path):
@@ -185,8 +185,8 @@ def test_overlapping_windows_of_a_recording_are_one_group(root: Path):
     recording = synthesize_clip("reaching", 5, seconds=14.0)
     for start in range(0, 600, 120):
         write_clip(root / f"window_{start:03}.npz", cut(recording, start, start + 240))
-    assert set(survey(root).duplicates.values()) == {"window_000"}
-    assert len(survey(root).duplicates) == 4
+    assert set(survey_folder(root).duplicates.values()) == {"window_000"}
+    assert len(survey_folder(root).duplicates) == 4
 
 
 def test_repetitions_and_cuts_without_common_frames_are_different(root: Path):
@@ -195,7 +195,7 @@ def test_repetitions_and_cuts_without_common_frames_are_different(root: Path):
         write_clip(root / f"{activity}_again.npz", recorded(activity, 2))
     for name, (start, end) in {"first": (0, 300), "second": (300, 600)}.items():
         write_clip(root / f"{name}.npz", cut(recording, start, end))
-    assert survey(root).duplicates == {}
+    assert survey_folder(root).duplicates == {}
 
 
 def test_a_common_rest_pose_is_not_a_shared_stretch(root: Path):
@@ -205,7 +205,7 @@ def test_a_common_rest_pose_is_not_a_shared_stretch(root: Path):
         place = np.repeat(clip.trans[:1], 180, 0)
         poses, trans = np.concatenate([still, clip.poses]), np.concatenate([place, clip.trans])
         write_clip(root / f"{activity}_late.npz", replace(clip, poses=poses, trans=trans))
-    assert survey(root).duplicates == {}
+    assert survey_folder(root).duplicates == {}
 
 
 def test_a_clip_too_short_for_a_stretch_has_no_marks_beyond_its_middle():
@@ -219,7 +219,7 @@ def test_copies_are_drawn_together(root: Path, tmp_path: Path):
     for activity in ACTIVITIES:
         again = cut(recorded(activity), 60)
         write_clip(root / "b" / f"{activity}.npz", again if activity < "s" else resample(again, 30.0)[0])
-    manifest = prepare(ClipFolder(root, SeededSplit(test=0.3, val=0.3)), tmp_path / "cache")
+    manifest = prepare_cache(ClipFolder(root, SeededSplit(test=0.3, val=0.3)), tmp_path / "cache")
     parts = {clip.name: clip.split for clip in manifest.clips}
     assert set(parts.values()) == {"train", "val", "test"}
     assert all(parts[f"a/{activity}"] == parts[f"b/{activity}"] for activity in ACTIVITIES)
@@ -234,5 +234,5 @@ def test_the_training_part_of_a_list_gives_way_to_its_test_part(root: Path, tmp_
         for phase in ("train", "test"):
             (lists / f"{phase}_split.txt").touch()
         (lists / f"{part}_split.txt").write_text("".join(f"{name}.npz\n" for name in names))
-    manifest = prepare(ClipFolder(root, ListSplit(tmp_path / "lists", val=0)), tmp_path / "cache")
+    manifest = prepare_cache(ClipFolder(root, ListSplit(tmp_path / "lists", val=0)), tmp_path / "cache")
     assert manifest.duplicates == {"a/running": "b/cut"}

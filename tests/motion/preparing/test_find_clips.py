@@ -11,8 +11,8 @@ from memmlp.common.errors import InputError
 from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.formats.npz import write_clip
-from memmlp.motion.preparing.cache import ClipFolder, prepare
-from memmlp.motion.preparing.find_clips import Folders, clip_name, find_clips
+from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
+from memmlp.motion.preparing.find_clips import NamedFolders, find_clips, get_clip_name
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
 
@@ -28,7 +28,7 @@ def root(tmp_path: Path) -> Path:
 def test_any_case_of_the_suffix_is_found(root):
     found = find_clips(root)
     assert found.files == ["a/1.npz", "a/2.npz", "b/UP.NPZ"]
-    assert [clip_name(file) for file in found.files] == ["a/1", "a/2", "b/UP"]
+    assert [get_clip_name(file) for file in found.files] == ["a/1", "a/2", "b/UP"]
 
 
 def test_hidden_folders_and_files_are_no_data(root):
@@ -84,14 +84,14 @@ def mixed(home: Path, **names: str) -> ClipFolder:
     split = SeededSplit(test=0.3, val=0.3)
     paired = SeededSplit(test=0.3, val=0.3, groups=["^(take[0-9])/"])
     splits = {name: paired if folder == "two" else split for name, folder in names.items()}
-    return ClipFolder(Folders({name: home / names[name] for name in names}), MixedSplit(splits))
+    return ClipFolder(NamedFolders({name: home / names[name] for name in names}), MixedSplit(splits))
 
 
 def test_each_source_is_split_as_it_is_alone(home):
-    manifest = prepare(mixed(home, a="one", b="two"), home / "cache")
+    manifest = prepare_cache(mixed(home, a="one", b="two"), home / "cache")
     assert manifest.sources == ("a", "b")
     parts = {clip.name: clip.split for clip in manifest.clips}
-    alone = prepare(ClipFolder(home / "one", SeededSplit(test=0.3, val=0.3)), home / "alone")
+    alone = prepare_cache(ClipFolder(home / "one", SeededSplit(test=0.3, val=0.3)), home / "alone")
     assert alone.sources == ()
     assert {f"a/{clip.name}": clip.split for clip in alone.clips}.items() <= parts.items()
     assert [name for name in parts if name.startswith("b/")] == [f"b/take{n // 2}/{n}" for n in range(8)]
@@ -100,13 +100,13 @@ def test_each_source_is_split_as_it_is_alone(home):
     assert manifest.groups["a/take0/1"] == "a/take0/1"
     assert manifest.groups["b/take0/1"] == "b/take0/0"
     assert all(parts[f"b/take{n}/{2 * n}"] == parts[f"b/take{n}/{2 * n + 1}"] for n in range(4))
-    assert prepare(mixed(home, a="one", c="two"), home / "other").digest != manifest.digest
+    assert prepare_cache(mixed(home, a="one", c="two"), home / "other").digest != manifest.digest
 
 
 def test_links_and_copies_are_known_across_sources(home):
     (home / "one" / "link.npz").symlink_to(home / "one" / "take0" / "0.npz")
     shutil.copy(home / "one" / "take1" / "2.npz", home / "two" / "take9.npz")
-    manifest = prepare(mixed(home, a="one", b="two"), home / "cache")
+    manifest = prepare_cache(mixed(home, a="one", b="two"), home / "cache")
     names = {clip.name for clip in manifest.clips}
     assert "a/link" in names  # the nearer path counts
     assert "a/take0/0" not in names
@@ -118,16 +118,16 @@ def test_errors_name_the_source(home):
     shutil.rmtree(home / "one" / "take0")
     shutil.rmtree(home / "one" / "take1")
     with pytest.raises(InputError, match=r"data\.sources\.a"):
-        prepare(mixed(home, a="one", b="two"), home / "cache")
+        prepare_cache(mixed(home, a="one", b="two"), home / "cache")
     with pytest.raises(InputError, match=r"data\.root"):
-        Folders.of([home / "x" / "clips", home / "y" / "clips"])
+        NamedFolders.from_paths([home / "x" / "clips", home / "y" / "clips"])
     with pytest.raises(InputError, match=r"data\.root=.*none"):
-        prepare(mixed(home, a="none", b="two"), home / "cache")
+        prepare_cache(mixed(home, a="none", b="two"), home / "cache")
 
 
 @pytest.mark.parametrize("drawn_by", ["frames", "clips"])
 def test_shares_say_how_often_a_window_is_of_each_source(home, drawn_by):
-    prepare(mixed(home, a="one", b="two"), home / "cache")
+    prepare_cache(mixed(home, a="one", b="two"), home / "cache")
     dataset = MotionDataset.open(home / "cache", "train")
     assert dataset.sources == [name.split("/")[0] for name in dataset.names]
     sources = np.array(dataset.sources)

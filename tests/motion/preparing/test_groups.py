@@ -7,7 +7,12 @@ from typing import Any
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.groups import Grouping, divided_remark, read_groups, unmatched_patterns_remark
+from memmlp.motion.preparing.groups import (
+    Grouping,
+    describe_divided_folders,
+    describe_unmatched_patterns,
+    read_groups,
+)
 
 
 def written(folder, text):
@@ -40,20 +45,25 @@ def test_bad_files_in_one_line(tmp_path, text, said):
 
 
 def test_clips_without_a_row_and_rows_without_a_clip_are_named(tmp_path):
-    grouping = Grouping.of([], written(tmp_path, "clip,group\na,1\nb,1\nc,2\n"))
+    grouping = Grouping.from_settings([], written(tmp_path, "clip,group\na,1\nb,1\nc,2\n"))
     grouping.check(["a", "b"], ["a", "b", "c"])  # c has a file that can't be used
     with pytest.raises(InputError, match="d and 1 more"):
         grouping.check(["a", "d", "e"], ["a", "b", "c", "d", "e"])
     with pytest.raises(InputError, match=r"data\.root.* c$"):
         grouping.check(["a", "b"], ["a", "b"])
-    Grouping.of([], None).check(["a"], [])
+    Grouping.from_settings([], None).check(["a"], [])
 
 
 def test_a_group_is_named_by_the_file_else_after_its_first_clip(tmp_path):
-    rows = Grouping.of(["^(x)"], written(tmp_path, "clip,group\na,ann\nb,ann\nx1,ben\nx2,cy\n"))
+    rows = Grouping.from_settings(["^(x)"], written(tmp_path, "clip,group\na,ann\nb,ann\nx1,ben\nx2,cy\n"))
     seen = {name: name for name in ("b", "a", "x2", "x1")}
-    assert rows.names(seen) == {"a": "ann", "b": "ann", "x1": "ben", "x2": "ben"}
-    assert Grouping.of(["^(x)"], None).names(seen) == {"a": "a", "b": "b", "x1": "x1", "x2": "x1"}
+    assert rows.name_groups(seen) == {"a": "ann", "b": "ann", "x1": "ben", "x2": "ben"}
+    assert Grouping.from_settings(["^(x)"], None).name_groups(seen) == {
+        "a": "a",
+        "b": "b",
+        "x1": "x1",
+        "x2": "x1",
+    }
 
 
 # Remarks
@@ -76,35 +86,35 @@ SESSIONS = [(f"{name.rpartition('/')[0]}/session{name[-1]}/take", part) for name
 @pytest.mark.parametrize(
     ("parts", "split", "said"),
     [
-        (TAKES, {"groups": ["salsa/(.*)"]}, "2 test clips are tied to no others"),
-        (TAKES, {}, "2 test clips are tied to no others"),
+        (TAKES, {"groups": ["salsa/(.*)"]}, "2 test clips share no group with other clips"),
+        (TAKES, {}, "2 test clips share no group with other clips"),
         (TAKES, {"groups": ["own/(.*?)/"]}, ""),
         (TAKES[:2], {}, ""),  # all in one folder, which is no person
         ([("a/1", "train"), ("a/2", "val"), ("b/1", "test")], {}, ""),
         ([(f"x/{name}", part) for name, part in TAKES], SOURCES, "2 test clips"),
-        (FLAT, {"groups": ["salsa/(.*)"]}, "1 test clips are tied to no others"),
-        (SESSIONS, {}, "2 test clips are tied to no others"),
+        (FLAT, {"groups": ["salsa/(.*)"]}, "1 test clips share no group with other clips"),
+        (SESSIONS, {}, "2 test clips share no group with other clips"),
         ([("c1/a", "train"), ("c2/a", "test"), ("c3/a", "train")], {}, ""),  # no folder is shared
     ],
 )
 def test_folders_with_clips_in_training_and_in_test_are_told(parts, split, said):
     """A folder is often a person, and no shipped pattern knows a custom folder."""
-    found = divided_remark(manifest_of(parts, split))
+    found = describe_divided_folders(manifest_of(parts, split))
     assert found.startswith(said) if said else found == ""
-    assert not divided_remark(manifest_of(parts, split | {"kind": "lists"}))
+    assert not describe_divided_folders(manifest_of(parts, split | {"kind": "lists"}))
     tied = [name for name, _ in parts]  # by a column file
-    assert not divided_remark(manifest_of(parts, split, tied))
+    assert not describe_divided_folders(manifest_of(parts, split, tied))
     if "sources" in split and said:
-        assert "x/own/anna and 1 more, are in training" in found
+        assert "the same folders (x/own/anna and 1 more)" in found
 
 
 def test_patterns_without_a_match_are_reported():
     split = {"groups": ["^(S[0-9])_", "^([^/]+/[^/]+)/take"]}
-    remark = unmatched_patterns_remark(split, ["ann/1", "ben/2"])
+    remark = describe_unmatched_patterns(split, ["ann/1", "ben/2"])
     assert "2 patterns" in remark
     assert "^(S[0-9])_" in remark
-    assert unmatched_patterns_remark(split, ["ann/1", "S1_2"]) == ""
-    assert unmatched_patterns_remark({"groups": []}, ["ann/1"]) == ""
-    assert unmatched_patterns_remark(split, ["CMU/CMU/01/take1"]) == ""
+    assert describe_unmatched_patterns(split, ["ann/1", "S1_2"]) == ""
+    assert describe_unmatched_patterns({"groups": []}, ["ann/1"]) == ""
+    assert describe_unmatched_patterns(split, ["CMU/CMU/01/take1"]) == ""
     mixed = {"kind": "mixed", "sources": {"one": split, "two": {"groups": ["(ann)"]}}}
-    assert unmatched_patterns_remark(mixed, ["one/ann/1", "two/ann/2"]).startswith("one: ")
+    assert describe_unmatched_patterns(mixed, ["one/ann/1", "two/ann/2"]).startswith("one: ")

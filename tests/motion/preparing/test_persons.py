@@ -81,8 +81,8 @@ def test_persons_of_a_kind_are_held_out_in_a_seeded_order():
 
 
 def test_absent_persons_are_missing():
-    assert split().listed == {"walking": 3, "dance": 2}
-    assert split().missing(["a1/x", "a3/y", "b1/x", "b2/x", "c/x"]) == ("walking/a2",)
+    assert split().entry_counts == {"walking": 3, "dance": 2}
+    assert split().find_missing_entries(["a1/x", "a3/y", "b1/x", "b2/x", "c/x"]) == ("walking/a2",)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_absent_persons_are_missing():
         ({"kinds": {**KINDS, "sports": Kind(("a1",), 0, 0)}}, "a1 has two kinds"),
         (
             {"kinds": {"walking": Kind(("a1", "a2"), 2, 1)}},
-            "data.split.kinds.walking: 2 persons for 2 in test",
+            "data.split.kinds.walking: must have 3 persons or more (2 for test",
         ),
     ],
 )
@@ -151,5 +151,5 @@ def test_the_real_sets_persons_are_in_one_part(shipped: MotionSource):
     used = [name for name in names if found.parts[name]]
     # Heads upside down, takes in another conversion, elbows about a wrong axis, floors.
     assert len(names) - len(used) == 2 + 20 + 3 + 2
-    assert shipped.clips.split.missing(used) == ()
+    assert shipped.clips.split.find_missing_entries(used) == ()
     assert_nobody_in_two_parts((found.groups[name], str(found.parts[name])) for name in used)

@@ -108,7 +108,7 @@ def test_a_list_without_its_counterpart_is_refused(tmp_path, gone):
     with pytest.raises(InputError, match=rf"MPI_HDM05 lacks {gone}_split.txt"):
         ListSplit(tmp_path)
     list_.write_text("")
-    assert ListSplit(tmp_path).listed == {"CMU": 2, "MPI_HDM05": 1}
+    assert ListSplit(tmp_path).entry_counts == {"CMU": 2, "MPI_HDM05": 1}
 
 
 def test_subsets_by_folder():
@@ -192,7 +192,7 @@ def test_subsets_under_every_name_but_once():
         found = split.assign([write(name) for name in OLD])
         assert None not in found.parts.values()
         assert len(set(found.groups.values())) == 6
-    assert split.missing(OLD[:8]) == ("CMU", "MPI_HDM05")
+    assert split.find_missing_entries(OLD[:8]) == ("CMU", "MPI_HDM05")
     with pytest.raises(InputError, match=r"data\.root"):
         split.assign([*OLD, stage_two(OLD[0])])
 
@@ -228,7 +228,7 @@ def test_subsets_are_found_within_archives_and_by_folders_of_ones_own():
     split = SubsetSplit(["CMU", "mine"], ["MPI_HDM05"])
     names = ["amass-1/CMU/01/a", "amass-2/MPI_HDM05/dg/b", "mine/CMU/01/c", "other/CMU/d"]
     found = split.assign(names)
-    assert split.missing(names) == ()
+    assert split.find_missing_entries(names) == ()
     assert [part is None for part in found.parts.values()] == [False, False, False, True]
     assert found.parts["amass-2/MPI_HDM05/dg/b"] == "test"
     with pytest.raises(InputError, match=r"data\.split.*CMU/01"):

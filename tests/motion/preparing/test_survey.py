@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from memmlp.motion.formats.npz import read_clip, write_clip
-from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit
-from memmlp.motion.preparing.survey import survey
+from memmlp.motion.preparing.survey import survey_folder
 from memmlp.motion.synthetic import synthesize_clip
 
 
@@ -38,12 +38,12 @@ def test_one_bad_file_never_stops_a_folder(root):
     shutil.copy(root / "a" / "0.npz", root / "line\nfeed.npz")
     shutil.copy(root / "a" / "0.npz", root / "a" / "1.NPZ")
     (root / "directory.npz").mkdir()
-    found = survey(root)
+    found = survey_folder(root)
     assert {file.file: file.reason.split(";")[0] for file in found.skipped} == {
-        "text.npz": "not a zip, so not an npz (memmlp data import makes one of BVH)",
+        "text.npz": "not a zip, so not an npz file",
         "dangling.npz": "cannot be read (No such file or directory)",
         "pipe.npz": "not a regular file",
-        r"line\nfeed.npz": "line feeds or other control characters in its name",
+        r"line\nfeed.npz": "the name has control characters",
         "a/1.npz": "a/1.NPZ has the same name",
     }
     assert len(found.clips) == 4
@@ -56,7 +56,7 @@ def test_other_units_are_skipped_and_odd_clips_are_reported(root):
     poses = clip.poses.copy()
     poses[:, 0] = [0.0, 0.1, 0.0]
     write_clip(root / "x.npz", type(clip)("x", poses, 0.1 * clip.trans + [0, 5, 0], 60.0))
-    found = survey(root)
+    found = survey_folder(root)
     assert [file.file for file in found.skipped] == ["degrees.npz"]
     assert set(found.unusual) == {"x"}
 
@@ -77,7 +77,9 @@ def test_no_frames_are_in_two_parts_however_they_were_copied(root, tmp_path):
         (root / "b").mkdir(exist_ok=True)
         shutil.copy(root / "a" / f"{name}.npz", root / "b" / f"{name}.npz")
         again(root / "a" / f"{name}.npz", root / "b" / f"again{name}.npz")
-    manifest = prepare(ClipFolder(root, SeededSplit(test=0.3, val=0.3), min_frames=20), tmp_path / "cache")
+    manifest = prepare_cache(
+        ClipFolder(root, SeededSplit(test=0.3, val=0.3), min_frames=20), tmp_path / "cache"
+    )
     assert manifest == Manifest.load(tmp_path / "cache")
     parts = contents(manifest)
     assert len(parts) == 4
@@ -98,8 +100,10 @@ def test_a_list_with_the_same_frames_in_two_parts_keeps_those_of_its_test(root, 
     (folder.parent / "b").mkdir()
     (folder.parent / "b" / "train_split.txt").touch()
     (folder.parent / "b" / "test_split.txt").write_text("b/copy.npz\n")
-    manifest = prepare(ClipFolder(root, ListSplit(tmp_path / "lists"), min_frames=20), tmp_path / "cache")
+    manifest = prepare_cache(
+        ClipFolder(root, ListSplit(tmp_path / "lists"), min_frames=20), tmp_path / "cache"
+    )
     assert manifest.duplicates == {"a/1": "b/copy"}
     assert {clip.name for clip in manifest.clips} == {"a/0", "a/2", "a/3", "b/copy"}
     assert manifest.left_out == {}
-    assert manifest.coverage.whole
+    assert manifest.coverage.is_complete

@@ -10,7 +10,7 @@ from bvh_samples import write
 from PIL import Image
 from skeleton_families import walking
 
-from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.body import make_builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.convert import view_stance
 from memmlp.motion.importing.skeleton_map import find_skeleton
@@ -28,7 +28,7 @@ def columns(picture: np.ndarray, colour: str) -> np.ndarray:
 def test_sides_are_on_their_sides(tmp_path: Path, far: bool):
     """The view does not cover unmapped nodes far away."""
     bvh = read_bvh(write(tmp_path, walking("mixamo").text()))
-    stance = view_stance(bvh, find_skeleton(bvh), builtin_rest_joints())
+    stance = view_stance(bvh, find_skeleton(bvh), make_builtin_rest_joints())
     if far:
         stance.positions[stance.nodes.index("HeadTop_End")] += [50.0, 0.0, 50.0]
     write_skeleton_picture(tmp_path / "out.png", stance, "a file")
