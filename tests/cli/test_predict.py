@@ -49,7 +49,7 @@ def test_a_test_clip_is_written_in_every_format(home: Path, run: str, clip: str)
         opened = open_run(Path("outputs"), run)
         frames = opened.test.read_clip(0)
         expected = predict_clip(opened.network(), frames, "stream")["predicted_positions"]
-    root = read_bvh(home / "a.bvh").kinematics()[1][:, 0]
+    root = read_bvh(home / "a.bvh").compute_kinematics()[1][:, 0]
     np.testing.assert_allclose(root / 100, expected[:, 0][:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
 
 

@@ -112,7 +112,7 @@ def test_bad_searches_are_refused_before_anything_runs(tmp_path: Path):
 @pytest.mark.slow
 def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The interval of validations decides which trials are pruned, how a network is used what they show."""
-    monkeypatch.setattr(Range, "corners", lambda self: ())  # which are checked above, and name nothing
+    monkeypatch.setattr(Range, "list_corners", lambda self: ())  # which are checked above, and name nothing
 
     def folder(*words: str) -> str:
         return prepare_search([*TINY, *words], None, tmp_path).folder.name
@@ -146,7 +146,7 @@ def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytes
         next(Path("mine").rglob("*.npz")).unlink()
         director.update(2)
 
-    monkeypatch.setattr(director_module, "direct", replaced)
+    monkeypatch.setattr(director_module, "direct_search", replaced)
     with pytest.raises(InputError, match="mine: clips have changed since the search started"):
         search(setup, study, Workers())
     assert len(study.trials) == 1

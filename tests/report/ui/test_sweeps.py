@@ -68,7 +68,7 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
         {"step": s, "phase": "train", "time": s / 100, "values": {"loss": 1}} for s in range(0, 1001, 100)
     ]
     run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    monkeypatch.setattr(Run, "doing", property(lambda self: None if self.done else "training"))
+    monkeypatch.setattr(Run, "activity", property(lambda self: None if self.done else "training"))
     sweeps = sweeps_of(outputs)
     found = describe(sweeps)
     assert found["counts"] == {"done": 5, "training": 1}
