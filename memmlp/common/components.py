@@ -262,7 +262,7 @@ def _is_constant(node: ast.stmt) -> bool:
 
 
 def _find_decorated(namespace: Mapping[str, Any], one: Component) -> Any:
-    """Return the object in a module's namespace that declares the component; None if there is none."""
+    """Return the object in a module's namespace that declares the component; None without one."""
     option = f"{one.slot}={one.name}"
     return next(
         (kind for kind in namespace.values() if getattr(kind, "__dict__", {}).get("option") == option), None

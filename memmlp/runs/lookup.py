@@ -114,7 +114,7 @@ class Notes:
 
     Attributes:
         tags: the tags, sorted.
-        note: the note; empty if there is none.
+        note: the note; may be empty.
     """
 
     tags: tuple[str, ...] = ()

@@ -374,7 +374,7 @@ class Run:
 
     @property
     def evaluations_as_configured(self) -> EvaluationsAsConfigured:
-        """The evaluations that match the run's config, read anew."""
+        """The evaluations that match the config of the run; each access reads the files."""
         return EvaluationsAsConfigured(self.evaluations, self.config)
 
     @property

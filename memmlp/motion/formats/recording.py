@@ -20,7 +20,7 @@ class Recording:
         nodes: names of the nodes, all different; each node comes after its parent.
         node_parents: index of each node's parent; -1 for the root.
         offsets: each node's position minus its parent's in the zero pose (nodes, 3).
-        fps: frame rate in the file, Hz; None if the file has none.
+        fps: frame rate in the file, Hz; None without a frame rate.
         values: the numbers of all frames in the file (N, C).
     """
 

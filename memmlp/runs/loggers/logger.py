@@ -59,7 +59,7 @@ class RunFacts:
         config: the run's config by dotted key, as text.
         origin: facts about its origin, by name.
         tags: the run's tags.
-        note: the run's note; empty if there is none.
+        note: the run's note; may be empty.
         data: name and digest of its data.
         results: its results, as points at the last training step.
         outdated: the modes with outdated results and their changed component versions; empty if current.
