@@ -86,7 +86,7 @@ def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["99"], ("no such sweep", "the number of a table of the paper, 1 to 17", "memory_control")),
+        (["99"], ("no such sweep", "a table's number from 1 to 17", "memory_control")),
         (["14", "bad=1"], ("data.root",)),
         (["all", "bad=1"], ("data.root",)),
         (["14", "--out", "table.pdf"], ("--out table.pdf", "md, tex, json")),
