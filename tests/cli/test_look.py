@@ -73,11 +73,11 @@ def test_a_films_branch_mode_and_times(memmlp: Memmlp, finished: Run, clips: lis
         ),
         (["--out", "a.avi"], ("--out a.avi", ".mp4")),
         (["--out", "no/a.png"], ("no folder no",)),
-        (["--from", "900", "--out", "a.png"], ("--from 900", "no frame between")),
+        (["--from", "900", "--out", "a.png"], ("--from 900", "must contain a frame")),
         (["--from", "1", "--to", "1", "--out", "a.png"], ("--from 1 --to 1",)),
         (["--from", "nan", "--out", "a.png"], ("--from", "finite number")),
         (["--to", "inf", "--out", "a.png"], ("--to", "finite number")),
-        (["--label", "a", "--label", "b", "--out", "a.png"], ("2 for 1 runs",)),
+        (["--label", "a", "--label", "b", "--out", "a.png"], ("2 labels for 1 runs",)),
     ],
 )
 def test_bad_input_to_render_is_one_line(memmlp: Memmlp, finished: Run, arguments, words):

@@ -48,7 +48,7 @@ def test_every_command_knows_where_a_clip_is_from(home):
     assert shown["title"].endswith("(test clips of two alone)")
     (row,) = [row for row in report["clips"] if row["source"] == "two"]
     assert f"{row['rotation']['MPJPE']:.4f}"[:5] in table
-    assert "expected one, two" in run(home, "table", "both.yaml", *TINY, "--source", "three", code=2)
+    assert "must be one or two" in run(home, "table", "both.yaml", *TINY, "--source", "three", code=2)
     run(home, "results", "save", "both.yaml", *TINY, "--out", "pages/data")
     run(home, "results", "docs", "--folder", "pages")
     page = (home / "pages" / "both.md").read_text()

@@ -82,7 +82,7 @@ def test_foreign_clips_need_the_run_alone(home: Path, run: str, tmp_path: Path):
     assert not (tmp_path / "outputs" / "cache").exists()
     write_json(tmp_path / "clips" / "import.json", describe_body("model.npz", np.ones((22, 3))))
     line = command_line.run(tmp_path, "predict", run, "clips", "--out", "b", "--format", "gltf", code=2)
-    assert "imported onto the body model.npz" in line
+    assert "imported for the body model.npz" in line
 
 
 def names(folder: Path, suffix: str) -> set[str]:

@@ -98,7 +98,7 @@ def test_named_sources_have_groups_of_their_own():
         ({"sources": {}}, [], "data.sources.bandai.root: has no value"),
         ({"root": "a"}, [], "data.root=a"),
         ({"sources": {**MIX["sources"], "c/d": {"root": "a"}}}, [], "data.sources.c/d"),
-        ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "data.sources: must have a weight"),
+        ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "data.sources: expected a weight"),
         (with_source(root="nowhere"), [], "data.sources.cmu.root=nowhere"),
         (with_source(weight=0), [], "data.sources.cmu.weight=0"),
         (with_source(weigt=3), [], "data.sources.cmu.weigt: no such key; did you mean weight"),

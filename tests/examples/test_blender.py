@@ -64,7 +64,7 @@ def test_bones_stand_at_the_joints_of_the_stream(played: Callable[[str], Played]
         sys.executable,
         EXAMPLES / "python/full_body.py",
         clip.network,
-        clip.interpolate_trackers,
+        clip.trackers,
         "--save",
         motion,
     ]

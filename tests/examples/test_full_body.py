@@ -86,7 +86,7 @@ def test_it_prints_the_joints_of_the_stream_and_refuses_bad_files(
     command: Command, played: Callable[[str], Played], step_files: Callable[[str], Path], tmp_path: Path
 ):
     clip = played("unity")
-    done = ran(command, clip.network, clip.interpolate_trackers)
+    done = ran(command, clip.network, clip.trackers)
     assert done.returncode == 0, done.stderr
     header, *rows = done.stdout.splitlines()
     assert header.split(",") == [f"{joint}.{axis}" for joint in JOINTS for axis in "xyz"]
@@ -94,13 +94,13 @@ def test_it_prints_the_joints_of_the_stream_and_refuses_bad_files(
     assert wearer.fastest(joints) > 10  # centimetres a second: it moves
     np.testing.assert_allclose(joints, clip.joints, atol=1e-4)
 
-    lines = clip.interpolate_trackers.read_text().splitlines()
+    lines = clip.trackers.read_text().splitlines()
     lines[2] = re.sub(r",[^,]+,", ",nan,", lines[2], count=1)
     damaged = tmp_path / "damaged.csv"
     damaged.write_text("\n".join(lines))
     done = ran(command, clip.network, damaged)
     assert done.returncode == 1
     assert re.fullmatch(r"\S+damaged.csv: line 3: not [^\n]+\n", done.stderr)
-    done = ran(command, step_files("mem_mlp"), clip.interpolate_trackers)
+    done = ran(command, step_files("mem_mlp"), clip.trackers)
     assert done.returncode == 1
     assert re.fullmatch(r"[^\n]*not written by memmlp export with --scope full\n", done.stderr)

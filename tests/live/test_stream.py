@@ -360,7 +360,7 @@ def test_bad_arguments_are_rejected(file, step_files):
         (lambda: Stream(5), "source="),
         (lambda: Stream(""), "source="),
         (lambda: Stream(file, rotations="euler"), "rotations=euler"),
-        (lambda: Stream(file, offsets=Offsets(np.zeros(3), np.eye(3))), "offsets: shapes"),
+        (lambda: Stream(file, offsets=Offsets(np.zeros(3), np.eye(3))), "offsets: must be positions"),
         (lambda: Stream(file).calibrate(one, one, one), "calibrate: the hands are not apart"),
         (lambda: Stream(file).calibrate(one, None, one), r"calibrate: .*left"),
         (lambda: Stream(file).step(one, two, one), "left: quaternion has norm 2"),

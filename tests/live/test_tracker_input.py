@@ -76,7 +76,7 @@ def test_a_stream_warns_at_the_line_of_its_caller(step_files):
     for unit, second, kinds in (
         (1, 1, []),
         (100, 1, ["a hand over 5 m", "the head over 3 m"]),
-        (1, 1000, ["restarts with each"]),
+        (1, 1000, ["each restarts the network"]),
     ):
         stream = memmlp.Stream(step_files("no_memory"))
         turn = matrix_to_quaternion(UPRIGHT[None])[0]

@@ -61,7 +61,7 @@ def test_nothing_else_is_overwritten(tmp_path: Path):
         NOTHING.write(tmp_path)
     with pytest.raises(InputError, match="is a file"):
         check_site_folder(tmp_path / "thesis.tex")
-    with pytest.raises(InputError, match="there is no folder"):
+    with pytest.raises(InputError, match="does not exist"):
         check_site_folder(tmp_path / "none" / "site")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 

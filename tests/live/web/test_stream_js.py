@@ -99,7 +99,7 @@ PARTS: dict[str, dict[str, Any]] = {
 HEAD, LEFT, RIGHT = t_pose()
 HANGING = [HEAD, LEFT | {"position": [0.15, 0.85, 0.45]}, RIGHT | {"position": [0.15, 0.85, -0.05]}]
 REFUSED = {
-    "exchanged, or is the head's device mounted backwards": [HEAD, RIGHT, LEFT],
+    "the head looks backwards relative to the hands": [HEAD, RIGHT, LEFT],
     "cm from its joint in a T-pose": HANGING,
 }
 
