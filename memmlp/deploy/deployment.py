@@ -95,7 +95,7 @@ class Deployment:
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e}; "
                 f"must be at most {TOLERANCE:.0e}, or rounding errors"
             )
-        record = self.measure_times(model, deployed.onnx)
+        record: dict[str, Any] = dict(self.measure_times(model, deployed.onnx))
         record |= latency.measure_size(model, network, deployed.onnx)
         record |= {
             "graph": "streaming" if isinstance(network, StreamingGraph) else "naive",
