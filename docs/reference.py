@@ -295,7 +295,8 @@ def keys_table(keys: list[Key]) -> str:
     rows = ["| key | default | allowed | |", "|---|---|---|---|"] if keys else []
     for key in keys:
         value = key.value if key.value == "(give one)" else f"`{key.value}`"
-        rows.append(f"| `{key.name}` | {value} | {key.limits} | {cell(key.comment)} |")
+        name = key.name.replace("|", "\\|")  # a pattern as a key
+        rows.append(f"| `{name}` | {value} | {key.limits} | {cell(key.comment)} |")
     return "\n".join(rows)
 
 

@@ -2,6 +2,7 @@
 
 **VMC** (protocol.vmc.info/english) is an OSC protocol. VSeeFace, Warudo, EVMC4U and other programs receive
 it. Each frame has these messages:
+
 - `/VMC/Ext/OK`: loaded, calibrated, normal mode (version 2.5).
 - `/VMC/Ext/T`: seconds since the start.
 - `/VMC/Ext/Root/Pos`: the root, which stays at the origin. The hips contain all movement, because some

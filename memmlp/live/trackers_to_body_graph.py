@@ -3,11 +3,13 @@
 `memmlp.live.stream` does the same in Python.
 
 Inputs, one frame at 60 Hz:
+
 - `tracker_positions` (1, 3, 3): head, left and right wrist, metres.
 - `tracker_rotations` (1, 3, 3, 3): matrices of the same joints.
 - `state.*`: the states; all zeros at the start.
 
 Outputs:
+
 - `rotations` (1, 22, 3, 3): local matrices; the root rotation is global. With `rotations=quaternion`, they
   are unit quaternions xyzw (1, 22, 4) with w >= 0.
 - `positions` (1, 22, 3): metres, by forward kinematics with the head on its tracker.
