@@ -95,7 +95,7 @@ def _no_process_is_left() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _parse_interpolations_once() -> None:
-    """OmegaConf parses each `${seed}` anew, which is a third of a composition."""
+    """OmegaConf parses each `${seed}` again, which is a third of a composition."""
     omegaconf.base.parse = functools.lru_cache(maxsize=1000)(omegaconf.base.parse)
 
 
