@@ -61,13 +61,6 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 @source_option
 @together_option
 @click.option(
-    "--add",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="File of browser measurements to add to Table 17, from the benchmark of memmlp web; repeatable.",
-)
-@click.option(
     "--untrained",
     is_flag=True,
     help="Measure the costs of networks without a run, with random weights; only for Tables 16 and 17.",
@@ -89,7 +82,6 @@ def table(
     branch: str | None,
     source: str | None,
     together: tuple[str, ...],
-    add: tuple[Path, ...],
     untrained: bool,
     seeds_needed: bool,
     outputs: Path,
@@ -99,10 +91,8 @@ def table(
     NAME is the path of a sweep file, a shipped sweep, the number of a table, or `all`. Use the same OVERRIDES
     as in `memmlp sweep`, so that the command finds the sweep's runs.
     """
-    from memmlp.report.tables import rows_measured_in_browsers
     from memmlp.report.tables.measured_run import load_measured_run
 
-    measured = [rows_measured_in_browsers.read_bench(path) for path in add]
     selection = TableSelection(branch, source, together, untrained)
     gc.disable()  # garbage collection takes a second and finds nothing here
     try:
@@ -114,7 +104,7 @@ def table(
     if seeds_needed:
         print_needed_seeds(found, SHOWN_MODES[mode])
         return
-    tables = [functools.reduce(rows_measured_in_browsers.add_rows, measured, one.table) for one in found]
+    tables = [one.table for one in found]
     if form is None and out is None:
         print_tables(tables)
         return

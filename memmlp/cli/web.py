@@ -1,4 +1,4 @@
-"""`memmlp web`: a static site that times networks, plays clips and shows the user's body in a browser."""
+"""`memmlp web`: a static site that plays clips and shows the user's body in a browser."""
 
 from __future__ import annotations
 
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
     from memmlp.live.web.site import SiteClip, SiteNetwork
 
-BASE = ("profile=paper", "model=avatar_poser")
-"""The reference network of the benchmark: AvatarPoser with its paper's size and random weights."""
-
 
 @click.command("web")
 @click.argument("runs", nargs=-1, required=True)
@@ -41,7 +38,6 @@ BASE = ("profile=paper", "model=avatar_poser")
     type=FiniteFloat(1, 600),
     help="Maximum length of a clip in seconds; longer clips are cut to their middle.",
 )
-@click.option("--no-bench", is_flag=True, help="Leave out the benchmark and its network graphs.")
 @plugins_option
 @outputs_option
 def web(
@@ -49,19 +45,17 @@ def web(
     out: Path,
     clips: int,
     seconds: float,
-    no_bench: bool,
     outputs: Path,
 ) -> None:
     """Make a static web site of finished RUNS (ids, beginnings of ids, or folders).
 
-    In a browser, including a headset's, the site times each network, plays test clips, and shows the user's
-    body in a mirror (docs/guides/web.md). The first call downloads onnxruntime-web from the npm registry.
+    In a browser, including a headset's, the site plays test clips and shows the user's body in a mirror, with
+    the time of each pose (docs/guides/web.md). The first call downloads onnxruntime-web from npm's registry.
     """
     check_runs_exist(outputs, *runs)
     from memmlp.common.errors import InputError
-    from memmlp.config.build import build_untrained
     from memmlp.config.open_run import open_run
-    from memmlp.live.web.site import RANDOM, Site, SiteNetwork, check_site_folder
+    from memmlp.live.web.site import Site, check_site_folder
 
     check_site_folder(out)
     opened = [open_run(outputs, run) for run in dict.fromkeys(runs)]
@@ -69,10 +63,8 @@ def web(
         raise InputError(f"{' '.join(runs)}: expected each run only once")
     clips_by_run = {one.run.id: pack_clips(one, clips, seconds) for one in opened}
     networks = [describe_network(one, clips_by_run[one.run.id]) for one in opened]
-    base = None if no_bench else SiteNetwork("avatar-poser", "AvatarPoser", RANDOM, build_untrained(BASE))
     site = Site(
         networks=networks,
-        base=base,
         clips=list({clip.key: clip for some in clips_by_run.values() for clip in some}.values()),
     )
     size = site.write(out)

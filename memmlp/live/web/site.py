@@ -7,16 +7,13 @@ import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import onnx
-import torch
-from onnx import numpy_helper
 
 from memmlp import __version__
 from memmlp.common.errors import InputError
@@ -25,18 +22,15 @@ from memmlp.common.lease import publish, temporary_path
 from memmlp.common.npm import ONNXRUNTIME_WEB, read_package_files
 from memmlp.common.page_server import build_security_policy, read_page_file
 from memmlp.common.progress import announce
-from memmlp.deploy.export import export
-from memmlp.deploy.latency import make_yardstick
-from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.live.rotations import BodyTree, matrix_to_quaternion
 from memmlp.live.session.loop import TOP
 from memmlp.live.session.sources import TrackedClip
 from memmlp.live.spaces import SPACES
 from memmlp.live.trackers_to_body_graph import export_full
 from memmlp.live.wearer import compute_body_height
-from memmlp.motion.body import FPS, FRAME_DIM, JOINTS, PARENTS, TRACKED
+from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED
 from memmlp.motion.limb_shapes import HEAT, LIMBS
-from memmlp.networks.motion_model import MotionModel, StreamingGraph
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import has_streaming_graph, streaming
 
 ABOUT = "site.json"
@@ -61,10 +55,6 @@ NUMBERS = 9 + 12 + 66
 """Number of values per frame: positions and quaternions (xyzw) of head and wrists, and joint positions.
 
 Positions are in metres; all values are in openxr axes."""
-LEAST = 32_768  # bytes; smaller tensors, such as constants, keep their values
-PERIOD = 4099  # random weights repeat after this number of values, so files compress well
-RANDOM = "random"  # the run id of networks with random weights, which are only timed
-PRECISIONS = {"naive": ("fp32",), "streaming": ("fp32", "int8", "fp16")}
 
 Entry = dict[str, Any]
 
@@ -76,7 +66,7 @@ class SiteNetwork:
     Attributes:
         key: the network's name in file names and the page's code.
         name: the network's display name.
-        run: the id of the network's run; "random" for random weights.
+        run: the id of the network's run.
         model: the trained network.
         clips: names of its test clips on the site.
         remark: a warning on the page, such as too little training; empty for no warning.
@@ -135,13 +125,11 @@ class Site:
     """The contents of a site.
 
     Attributes:
-        networks: the networks. Trained networks play clips and run on headsets.
-        base: the reference network for time comparisons; None for a site without a bench.
+        networks: the networks, which play clips and run on headsets.
         clips: the clips to play.
     """
 
     networks: Sequence[SiteNetwork]
-    base: SiteNetwork | None
     clips: Sequence[SiteClip]
 
     def write(self, out: Path) -> int:
@@ -175,21 +163,17 @@ class Site:
             | {"file": _write_file(folder, f"clips/{clip.key}.gz", clip.content)}
             for clip in self.clips
         ]
-        bench = self.base is not None
         about: Entry = {
             "memmlp": __version__,
             "made": now(),
             "packages": {ONNXRUNTIME_WEB.name: ONNXRUNTIME_WEB.version},
-            "networks": [write_network(folder, one, bench) for one in self.networks],
+            "networks": [write_network(folder, one) for one in self.networks],
             "clips": clips,
             "limbs": [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS],
             "joints": JOINTS,
             "heat": HEAT,
             "top": TOP,
         }
-        if self.base is not None:
-            about["base"] = write_network(folder, self.base, bench)
-            about["yardstick"] = write_timed_graph(folder, "yardstick", make_yardstick())
         _write_file(folder, ABOUT, (json.dumps(about, separators=(",", ":")) + "\n").encode())
         _write_page(folder)
 
@@ -205,31 +189,21 @@ def check_site_folder(out: Path) -> None:
         raise InputError(f"--out {out}: folder {out.parent} does not exist")
 
 
-def write_network(folder: Path, network: SiteNetwork, bench: bool) -> Entry:
-    """Write a network's graphs into a site's folder, and return the network's entry in `site.json`.
-
-    Args:
-        folder: the site's folder.
-        network: the network. A network with random weights is only timed.
-        bench: whether to write the timed graphs. The graph that plays clips is always written.
-    """
+def write_network(folder: Path, network: SiteNetwork) -> Entry:
+    """Write a network's full graph into a site's folder, and return the network's entry in `site.json`."""
     announce(f"web: export {network.name}")
-    model, played = network.model.cpu().eval(), None
-    if network.run != RANDOM:
-        with tempfile.TemporaryDirectory() as temporary:
-            path = Path(temporary) / "whole.onnx"
-            export_full(
-                streaming(model) if has_streaming_graph(model) else model, path, network.run, SPACE.name
-            )
-            played = _write_file(folder, f"networks/{network.key}.onnx.gz", path.read_bytes())
+    model = network.model.cpu().eval()
+    graph = streaming(model) if has_streaming_graph(model) else model
+    with tempfile.TemporaryDirectory() as temporary:
+        path = Path(temporary) / "whole.onnx"
+        export_full(graph, path, network.run, SPACE.name)
+        played = _write_file(folder, f"networks/{network.key}.onnx.gz", path.read_bytes())
     rest = model.normalizer.rest.double().numpy()
     return {
         "key": network.key,
         "name": network.name,
         "run": network.run,
-        "frames": model.frames,
         "fps": FPS,
-        "parameters": model.count_parameters(),
         "body": {  # head and wrists in the T-pose, the lowest joint's height, and the body height, metres
             "rest": (rest[list(TRACKED)] * SPACE.body).tolist(),
             "floor": float(rest[:, 1].min()),
@@ -237,66 +211,9 @@ def write_network(folder: Path, network: SiteNetwork, bench: bool) -> Entry:
             "eyes": EYES,
         },
         "play": played,
-        "graphs": list(write_graphs(folder, network)) if bench else [],
         "clips": list(network.clips),
         "remark": network.remark,
     }
-
-
-def write_graphs(folder: Path, network: SiteNetwork) -> Iterator[Entry]:
-    """Write the timed graphs of a network with random weights, and yield an entry for each.
-
-    The graphs are the published network, its stream, and its stream in lower precisions. Each is written as a
-    step and as a full graph from trackers to joints, except that int8 does not have a full graph.
-    """
-    model, frames = (
-        network.model,
-        [0.1 * torch.randn(60, FRAME_DIM)],
-    )  # the ranges of int8 do not affect the time
-    graphs: dict[str, MotionModel | StreamingGraph] = {"naive": model}
-    if has_streaming_graph(model):
-        graphs["streaming"] = streaming(model)
-    with tempfile.TemporaryDirectory() as temporary:
-        step, whole, lowered = (Path(temporary) / f"{name}.onnx" for name in ("step", "whole", "lower"))
-        for name, graph in graphs.items():
-            export(graph, step, network.run)
-            export_full(graph, whole, network.run, SPACE.name)
-            for precision in PRECISIONS[name]:
-                entry: Entry = {"graph": name, "precision": precision, "whole": None}
-                for part, source in {"step": step, "whole": whole}.items():
-                    if isinstance(graph, StreamingGraph) and precision != "fp32":
-                        if part == "whole" and precision == "int8":
-                            continue
-                        write_lower_precision(precision, source, lowered, graph, frames)
-                        source = lowered
-                    file = f"{network.key}-{name}-{precision}-{part}"
-                    entry[part] = write_timed_graph(folder, file, onnx.load(source))
-                yield entry
-
-
-def write_timed_graph(folder: Path, name: str, model: onnx.ModelProto) -> str:
-    """Write a graph with random weights for timing, and return its address."""
-    randomize_weights(model)
-    return _write_file(folder, f"networks/{name}.onnx.gz", model.SerializeToString())
-
-
-def randomize_weights(model: onnx.ModelProto) -> None:
-    """Replace the large weights of a graph by repeated random numbers with the same standard deviation.
-
-    Weights do not affect the time of a step, and repeated numbers compress well. The standard deviation stays
-    the same, because infinite or very small values would slow down a processor.
-    """
-    random = np.random.default_rng(0)
-    for tensor in model.graph.initializer:
-        values = numpy_helper.to_array(tensor)
-        if len(tensor.raw_data) < LEAST or values.dtype not in (np.float32, np.float16, np.int8):
-            continue
-        scale = np.sqrt(np.square(values.astype(np.float64)).mean())
-        if np.isfinite(scale):  # masks contain infinity
-            drawn = random.normal(0, scale, PERIOD)
-            if values.dtype == np.int8:
-                drawn = drawn.round().clip(-127, 127)
-            tensor.raw_data = np.resize(drawn.astype(values.dtype), values.size).tobytes()
 
 
 def _list_files(folder: Path) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -18,10 +17,10 @@ from filelock import FileLock
 from memmlp.common.errors import InputError
 from memmlp.common.npm import ONNXRUNTIME_WEB, Package, read_package_files
 from memmlp.deploy.export import export
-from memmlp.live.trackers_to_body_graph import export_full
 from memmlp.live.web.site import Site, SiteNetwork, pack_clip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.streaming import streaming
 
 RUN = "0123456789abcdef"
 REMARK = "hardly trained, in a test"
@@ -39,19 +38,6 @@ def network() -> MotionModel:
     return wearer.at_ease(tiny.model(NoMemory), PERSON.frames)
 
 
-def once(write: Callable[..., None]) -> Callable[..., None]:
-    """A writer of ONNX files that exports each kind of graph once; that takes seconds."""
-    files: dict[type, bytes] = {}
-
-    def written(model: object, path: Path, *rest: object) -> None:
-        if type(model) not in files:
-            write(model, path, *rest)
-            files[type(model)] = path.read_bytes()
-        path.write_bytes(files[type(model)])
-
-    return written
-
-
 def package_files(package: Package, *names: str) -> list[bytes]:
     """Files of an npm package; skips where they cannot be had."""
     try:
@@ -63,23 +49,18 @@ def package_files(package: Package, *names: str) -> list[bytes]:
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """A site with a network to play and wear, and the same beside it to be timed."""
+    """A site with a network to play and wear."""
     package_files(ONNXRUNTIME_WEB, "package.json")
     home = shared(tmp_path_factory, "web")
     made = Made(home / "site", home / "step.onnx")
-    with FileLock(home / "lock"), pytest.MonkeyPatch.context() as patched:
-        patched.setattr("memmlp.live.web.site.export", once(export))
-        patched.setattr("memmlp.live.web.site.export_full", once(export_full))
-        patched.setattr("memmlp.live.web.site.randomize_weights", lambda model: None)
+    with FileLock(home / "lock"):
         if not made.step.exists():
             clip = pack_clip("walk", PERSON.frames.numpy(), 4.0)
             Site(
                 networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,), REMARK)],
-                base=SiteNetwork("base", "AvatarPoser", "random", network()),
                 clips=[clip],
             ).write(made.folder)
-            bare = made.folder / "networks" / f"{RUN}-streaming-fp32-step.onnx.gz"
-            made.step.write_bytes(gzip.decompress(bare.read_bytes()))
+            export(streaming(network()), made.step, RUN)
     return made
 
 

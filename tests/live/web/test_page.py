@@ -1,4 +1,4 @@
-"""The site in a browser with a headset in software: worn, played, timed, and all offline."""
+"""The site in a browser with a headset in software: worn, played, and all offline."""
 
 from __future__ import annotations
 
@@ -17,18 +17,11 @@ from live.web.conftest import PERSON, REMARK, Made, package_files
 from memmlp.common.npm import IWER
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Offsets
-from memmlp.report.tables.rows_measured_in_browsers import read_bench
 
 pytestmark = pytest.mark.slow
 
 HEADSET = Path(__file__).with_name("headset.js")
 SITE = "document.documentElement.dataset"
-SAVED = """const click = HTMLAnchorElement.prototype.click;
-HTMLAnchorElement.prototype.click = function () {
-  if (this.download) window.saved = decodeURIComponent(this.href.split(',').slice(1).join(','));
-  else click.apply(this);
-}"""
-"""Keeps what the bench saves as a file."""
 TAPE = """import('./stream.js').then(({ Stream }) => {
   window.tape = [];
   const { step, calibrate } = Stream.prototype;
@@ -93,12 +86,11 @@ class Server(ThreadingHTTPServer):
         self.thread.join()
 
 
-def test_it_is_worn_played_and_timed_without_the_server(site: Made, tmp_path: Path):
+def test_it_is_worn_and_played_without_the_server(site: Made):
     """In one browser, whose start and first load take seconds."""
     (script,) = package_files(IWER, "build/iwer.min.js")
     with Browser(160, 120) as browser:
         browser.before(script.decode() + HEADSET.read_text())
-        browser.before(SAVED)
         browser.before(NOTE)
         server = Server(site.folder)
         try:
@@ -112,7 +104,6 @@ def test_it_is_worn_played_and_timed_without_the_server(site: Made, tmp_path: Pa
         assert server.missing == []
         check_wearer(worn(browser, site), site)
         check_play(browser)
-        check_bench(browser, tmp_path / "rows.json")
         assert browser.errors == []
 
 
@@ -235,22 +226,3 @@ def check_play(browser: Browser) -> None:
     browser.wait("document.querySelector('#pause').textContent == 'Play'")
     assert 0 < float(browser.value("document.querySelector('#mean').textContent")) < 200
     assert browser.value(REMARKED) == f"This network is {REMARK}."
-
-
-def check_bench(browser: Browser, file: Path) -> None:
-    """The bench's rows are such as Table 17 takes."""
-    go(browser, "bench", f"{SITE}.bench == 'ready'")
-    browser.value("document.querySelector('#device').value = 'Test headset'")
-    browser.value("document.querySelector('#steps').replaceChildren(new Option('few', 40))")
-    browser.value("document.querySelector('#start').click()")
-    browser.wait(f"{SITE}.bench == 'done' || document.querySelector('#start').textContent == 'Start'")
-    assert "Measured 8 rows" in browser.value("document.querySelector('#progress').textContent")
-    browser.value("document.querySelector('#save').click()")
-    file.write_text(browser.wait("window.saved"))
-    measured = read_bench(file)
-    assert measured.about["device"] == "Test headset"
-    kinds = [(row["network"], row["graph"], row["precision"]) for row in measured.rows]
-    graphs = [("naive", "fp32"), ("streaming", "fp32"), ("streaming", "int8"), ("streaming", "fp16")]
-    assert kinds == [(name, *graph) for name in ("AvatarPoser", "tiny") for graph in graphs]
-    assert {row["steps"] for row in measured.rows} == {40}
-    assert [row["whole_median_ms"] is not None for row in measured.rows] == [True, True, False, True] * 2

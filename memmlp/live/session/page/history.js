@@ -29,8 +29,9 @@ export class History {
   }
 }
 
-function percentiles(values) {
-  const sorted = values.sort((a, b) => a - b);
+// The median and the 95th percentile; null without values.
+export function percentiles(values) {
+  const sorted = [...values].sort((a, b) => a - b);
   const at = part => sorted[Math.min(Math.floor(part * sorted.length), sorted.length - 1)];
   return sorted.length ? [at(0.5), at(0.95)] : null;
 }

@@ -1,11 +1,10 @@
 // The pages by their addresses, the site's contents, and whether it works offline.
 
-import { bench } from './bench.js';
 import { h, replace } from './dom.js';
 import { play } from './play.js';
 import { wear } from './wear.js';
 
-const PAGES = { wear, play, bench };
+const PAGES = { wear, play };
 const content = document.getElementById('content');
 let leave = () => {};
 let home = 'wear';
@@ -16,7 +15,6 @@ async function begin() {
     if (!answer.ok) throw new Error(`site.json: the server answers ${answer.status}`);
     const site = await answer.json();
     about(site);
-    if (!site.base) document.querySelector('nav a[href="#/bench"]').remove();
     if (!(await wearable())) home = 'play';
     addEventListener('hashchange', () => show(site));
     show(site);
@@ -34,7 +32,7 @@ async function wearable() {
 
 function show(site) {
   const named = location.hash.replace(/^#\//, '').split('?')[0];
-  const name = named in PAGES && (named !== 'bench' || site.base) ? named : home;
+  const name = named in PAGES ? named : home;
   leave();
   document.title = `memmlp ${name}`;
   for (const link of document.querySelectorAll('.top nav a')) {

@@ -2,7 +2,7 @@
 
 import { h, replace, select } from './dom.js';
 import { History } from './history.js';
-import { fetched, WorkerProxy } from './worker_proxy.js';
+import { fetchFile, NetworkWorker } from './network_worker.js';
 import { Stage } from './stage.js';
 import { Stream } from './stream.js';
 
@@ -75,8 +75,8 @@ class Play {
   // Load network and clip, and play from the start.
   async begin() {
     const round = ++this.round;
-    this.proxy?.close();
-    this.proxy = new WorkerProxy();
+    this.worker?.close();
+    this.worker = new NetworkWorker();
     this.history.frames = [];
     this.history.resume();
     this.dropped = 0;
@@ -84,7 +84,7 @@ class Play {
     if (!this.clip) return this.showProblem('This site has no test clip of this network.');
     this.showProblem('Loading the network.');
     try {
-      const [content] = await Promise.all([fetched(this.clip.file), this.proxy.call('open', ['play', this.network.play])]);
+      const [content] = await Promise.all([fetchFile(this.clip.file), this.worker.open(this.network.play)]);
       const clip = new Clip(content.buffer);
       this.showProblem('');
       this.stage ??= this.makeStage();
@@ -112,7 +112,7 @@ class Play {
   // Feed the clip to the stream at 60 Hz, repeatedly. Frames that are due during a step are dropped.
   async rounds(clip, round) {
     const { body, fps } = this.network;
-    const stream = new Stream({ fps, body, run: frame => this.proxy.call('pose', ['play', frame]) });
+    const stream = new Stream({ fps, body, run: frame => this.worker.pose(frame) });
     for (;;) {
       stream.reset();
       const began = performance.now();
@@ -170,6 +170,6 @@ class Play {
 
   leave() {
     this.round++;
-    this.proxy?.close();
+    this.worker?.close();
   }
 }

@@ -1,12 +1,12 @@
 // Enter VR or AR: a body follows the wearer's head and hands, computed here, in front of a mirror.
 
 import { h, replace, select } from './dom.js';
+import { percentiles } from './history.js';
 import { kindsOf, trackersOf, usualOffsets } from './headset.js';
 import { WornScene } from './worn_scene.js';
-import { WorkerProxy } from './worker_proxy.js';
+import { NetworkWorker } from './network_worker.js';
 import { headingOf } from './rotations.js';
 import { Stream } from './stream.js';
-import { median, percentile } from './timing.js';
 
 const MODES = { 'immersive-vr': 'Enter VR', 'immersive-ar': 'Enter AR' };
 const COUNTDOWN = 3; // seconds from the trigger to the calibration
@@ -71,15 +71,16 @@ class Wear {
 
   // Load the network, and ask the browser what it can enter.
   async ready() {
-    const proxy = (this.proxy = (this.proxy?.close(), new WorkerProxy()));
+    this.worker?.close();
+    const worker = (this.worker = new NetworkWorker());
     try {
-      await proxy.call('open', ['wear', this.network.play]);
+      await worker.open(this.network.play);
     } catch (error) {
-      if (proxy === this.proxy) this.trouble.textContent = `The network did not load: ${error.message}`;
+      if (worker === this.worker) this.trouble.textContent = `The network did not load: ${error.message}`;
       return;
     }
     const can = await Promise.all(Object.keys(MODES).map(mode => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false));
-    if (proxy !== this.proxy) return;
+    if (worker !== this.worker) return;
     this.buttons.forEach((button, i) => { button.disabled = !can[i]; });
     const why = !window.isSecureContext ? 'This address is not secure: VR needs https or localhost.'
       : !navigator.xr ? 'This browser has no WebXR. Open this page in a headset’s browser.'
@@ -107,7 +108,7 @@ class Wear {
     const tall = this.tall(null);
     this.worn = {
       session, network: this.network, tall, kinds: [null, null], placed: false, calibrated: false, due: null, waiting: 0, frames: 0, skipped: 0, last: null, passed: [], times: [],
-      stream: new Stream({ fps, body, offsets: usualOffsets([null, null]), scale: body.height / tall, run: frame => this.proxy.call('pose', ['wear', frame]) }),
+      stream: new Stream({ fps, body, offsets: usualOffsets([null, null]), scale: body.height / tall, run: frame => this.worker.pose(frame) }),
     };
     this.seen.hidden = false;
     this.mirror.through(mode === 'immersive-ar');
@@ -209,8 +210,7 @@ class Wear {
     this.skippedText.textContent = worn.skipped;
     this.tallText.textContent = worn.tall.toFixed(2);
     if (!worn.times.length) return;
-    this.middleText.textContent = median(worn.times).toFixed(1);
-    this.p95Text.textContent = percentile(worn.times, 95).toFixed(1);
+    [this.middleText.textContent, this.p95Text.textContent] = percentiles(worn.times).map(ms => ms.toFixed(1));
   }
 
   end() {
@@ -224,7 +224,7 @@ class Wear {
 
   leave() {
     this.worn?.session.end();
-    this.proxy?.close();
+    this.worker?.close();
     this.mirror?.dispose();
   }
 }
@@ -232,6 +232,6 @@ class Wear {
 // The display's measured rate, and the expected one where the browser reports it.
 function rateOf({ passed, session }) {
   if (!passed.length) return '–';
-  const usual = (1000 / median(passed)).toFixed(0);
+  const usual = (1000 / percentiles(passed)[0]).toFixed(0);
   return session.frameRate ? `${usual} of ${session.frameRate.toFixed(0)}` : usual;
 }
