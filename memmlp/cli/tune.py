@@ -112,6 +112,8 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     parsed = parse_search(content)
     remaining = tuple(text for text in overrides if text not in own)
     setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
+    if not _make_requests(setup, {})[0].motion.prepare().has("val"):
+        raise InputError("data.split.val: must be above 0 for a search, which ranks trials on validation")
     base = _check_space(setup)
     counted = {**asdict(parsed), "n_trials": None, "storage": None}
     return setup._replace(folder=outputs / "tune" / f"{parsed.name}-{digest([base, counted])[:8]}")

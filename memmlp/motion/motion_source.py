@@ -34,6 +34,10 @@ class PreparedMotion(NamedTuple):
         """A digest of the data, which is part of run ids."""
         return self.manifest.digest
 
+    def has(self, part: str) -> bool:
+        """Return whether a part has clips; without validation clips, trainings are not validated."""
+        return bool(self.manifest.part(part))
+
     def open(self, part: str) -> MotionDataset:
         """Open a part of the cache, memory-mapped (`MotionDataset.open`).
 

@@ -64,7 +64,7 @@ class TrainingTask:
         return {}
 
     def validate(self) -> dict[str, float]:
-        """Compute the metrics on the validation split."""
+        """Compute the metrics on the validation split; {} without validation clips."""
         raise NotImplementedError
 
 
@@ -204,8 +204,8 @@ def record(
         count.set_note(f"loss {loss:.3g}")
     count.advance()
     if step % optim.validate_every == 0 or last:
-        values = validate(task, average)
-        run.log(step, values, phase="val")
+        if values := validate(task, average):
+            run.log(step, values, phase="val")
         return values
     return {}
 

@@ -200,6 +200,7 @@ def list_data_remarks(data: PreparedMotion) -> list[str]:
         describe_low_rates(manifest, manifest.clips, "clips"),
         describe_divided_folders(manifest),
         describe_unmatched_patterns(manifest.split, [clip.name for clip in manifest.clips]),
+        None if data.has("val") else "no validation clips, so trainings are not validated (data.split.val)",
     )
     return list(filter(None, found))
 

@@ -271,7 +271,8 @@ def train_run(
     steps = experiment.training.optim.steps
     announce(f"network: training for {steps} steps (run {run.id})")
     begin_run(experiment, run, experiment.identity(data.digest), experiment.config, before)
-    run.write_manifest({"body": data.manifest.body, **collect_data_warnings(experiment.config, data)})
+    facts = {"body": data.manifest.body, "validation_clips": len(data.manifest.part("val"))}
+    run.write_manifest(facts | collect_data_warnings(experiment.config, data))
     run.request_stages(experiment.stage_ids)
     run.clear_stages()
     weights = before.weights() if before else None

@@ -68,6 +68,16 @@ class Training:
         raise NotImplementedError
 
 
+def make_validation(
+    data: PreparedMotion, metrics: UserMetrics, device: torch.device
+) -> Callable[[MotionModel], dict[str, float]]:
+    """Return a function that measures a network on the validation clips; {} without validation clips."""
+    if not data.has("val"):
+        return lambda network: {}
+    pieces = modes.cut_clips(data.open("val").to(device), VALIDATION_PIECE, least=60)
+    return lambda network: modes.measure_stream(network, pieces, metrics)
+
+
 def read_last_errors(run: Run) -> dict[str, float]:
     """Return the errors of a run's last validation; empty in a process that does not validate."""
     found = [entry.values for entry in run.metrics() if entry.phase == "val"]
@@ -130,7 +140,6 @@ class NetworkTraining(Training):
         normalizer = architecture.make_normalizer(data.manifest, dataset.frames)
         model = architecture.build_for_training(normalizer, prerequisite).to(device)
         self.rollout.begin(model)
-        pieces = modes.cut_clips(data.open("val").to(device), VALIDATION_PIECE, least=60)
         return MotionTask(
             model,
             self.loss(model.branches).to(device),
@@ -138,7 +147,7 @@ class NetworkTraining(Training):
             MirroredDataset(dataset) if self.mirror else dataset,
             self.optim,
             self.seed,
-            validate=lambda network: modes.measure_stream(network, pieces, self.metrics),
+            validate=make_validation(data, self.metrics, device),
             drawn_by=self.drawn_by,
             shares=self.shares,
         )
@@ -222,7 +231,8 @@ class VQVAETraining(Training):
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
         """Train the architecture's VQ-VAE; it does not have a prerequisite. See Training."""
-        dataset, validation = (data.open(split).to(device) for split in ("train", "val"))
+        dataset = data.open("train").to(device)
+        validation = data.open("val").to(device) if data.has("val") else None
         torch.manual_seed(self.seed)
         normalizer = architecture.make_normalizer(data.manifest, dataset.frames).to(device)
         model = architecture.vqvae().to(device)
@@ -243,7 +253,7 @@ class VQVAETask(TrainingTask):
         model: VQVAE,
         normalizer: Normalizer,
         dataset: MotionDataset,
-        validation: MotionDataset,
+        validation: MotionDataset | None,
         optim: Optim,
         seed: int,
     ):
@@ -266,7 +276,9 @@ class VQVAETask(TrainingTask):
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Compute Eq. 1 and the perplexity on the validation frames."""
+        """Compute Eq. 1 and the perplexity on the validation frames; {} without validation."""
+        if self.validation is None:
+            return {}
         frames = self.normalizer.encode(self.validation.frames)
         vectors, index = self.model.codebook(self.model.encode(frames))
         used = torch.bincount(index, minlength=len(self.used)).float()

@@ -26,7 +26,7 @@ from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, t
 from memmlp.training.losses import FixedWeights, Loss, Terms, TermsLoss
 from memmlp.training.losses.terms import Comparison, measure_jerk
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import VALIDATION_PIECE, Training, read_last_errors
+from memmlp.training.train_network import Training, make_validation, read_last_errors
 
 STREAMS_TOGETHER = 64  # pieces that the network streams through side by side
 
@@ -117,14 +117,14 @@ class RefinerTraining(Training):
         finished = replace(architecture, refiner=None).load(prerequisite).to(device).requires_grad_(False)
         torch.manual_seed(self.seed)
         model = self.refiner.build(finished).to(device)
-        validation = modes.cut_clips(data.open("val").to(device), VALIDATION_PIECE, least=60)
+        validate = make_validation(data, self.metrics, device)
         task = RefinerTask(
             model,
             LOSSES[self.refiner.velocities](),
             dataset,
             self.draw_pieces(dataset),
             self.optim,
-            validate=lambda: modes.measure_stream(model.eval(), validation, self.metrics),
+            validate=lambda: validate(model.eval()),
         )
         train(task, self.optim, run, self.seed, "refiner", on_validation)
         finished.requires_grad_(True)

@@ -192,7 +192,8 @@ class SAGEPartTraining(Training):
             checkpoint.load_module(finished, module, before)
         halves = nn.ModuleDict({"net": net, "upper": parts["codes.upper"], "lower": parts["codes.lower"]})
         halves.eval().requires_grad_(False).to(device)
-        objective, validation = make_objective(self.kind, halves), data.open("val").to(device)
+        objective = make_objective(self.kind, halves)
+        validation = data.open("val").to(device) if data.has("val") else None
         task = SAGEPartTask(
             part.requires_grad_(True), objective, self.network, dataset, validation, net.frames
         )
@@ -229,15 +230,17 @@ class SAGEPartTask(TrainingTask):
         objective: Objective,
         network: NetworkTraining,
         dataset: MotionDataset,
-        validation: MotionDataset,
+        validation: MotionDataset | None,
         frames: int,
     ):
         self.module, self.objective, self.frames = part, objective, frames
         self.dataset = MirroredDataset(dataset) if network.mirror else dataset
         draws = network.optim.batch, frames, network.seed, network.drawn_by, network.shares
         self.sampler = WindowSampler(self.dataset, *draws)
-        drawn = WindowSampler(validation, VALIDATION_WINDOWS, frames, seed=0).draw(0)
-        self.validation = validation.read_stretches(*drawn, frames)
+        self.validation = None
+        if validation is not None:
+            drawn = WindowSampler(validation, VALIDATION_WINDOWS, frames, seed=0).draw(0)
+            self.validation = validation.read_stretches(*drawn, frames)
 
     def step(self, step: int) -> StepResult:
         """Compute the losses on a batch of windows."""
@@ -247,7 +250,12 @@ class SAGEPartTask(TrainingTask):
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Compute the losses on the validation windows, with all joints visible and with sampled latents."""
+        """Compute the losses on the validation windows, with all joints visible and with sampled latents.
+
+        The result is empty without validation windows.
+        """
+        if self.validation is None:
+            return {}
         return {name: float(term) for name, term in self.objective(self.validation, False).items()}
 
 

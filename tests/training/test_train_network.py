@@ -1,0 +1,43 @@
+"""The training of networks, of VQ-VAEs, and of their parts without validation clips."""
+
+from pathlib import Path
+
+import pytest
+
+from memmlp.runs.lookup import list_runs
+from memmlp.training.train_sage import PARTS
+
+UNVALIDATED = [
+    "profile=tiny", "data.synth.minutes=0.05", "data.split.val=0", "loggers=none", "threads=1",
+    "export.graph=off", "evaluation.modes=[stream]",
+]  # fmt: skip
+CHAINS = {
+    "model=mem_mlp": ("vqvae", "memmlp"),
+    "model=recurrent_poser": ("memmlp",),
+    "model=sage": (*PARTS, "memmlp"),
+    "refiner=sage": ("memmlp", "memmlp"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("network", CHAINS)
+def test_every_kind_of_training_can_do_without_validation(memmlp, network):
+    few = [f"{group}.steps=2" for group in ("optim", "vqvae")]
+    few += [f"prerequisite.{part}.steps=2" for part in PARTS if network == "model=sage"]
+    few += ["model=avatar_poser"] if network == "refiner=sage" else []
+    ran = memmlp("train", *UNVALIDATED, network, *few)
+    assert ran.code == 0, ran.err
+    assert "no validation clips" in ran.err
+    runs = list_runs(Path("outputs"))
+    assert sorted(run.manifest["kind"] for run in runs) == sorted(CHAINS[network])
+    for run in runs:
+        assert run.done
+        assert {entry.phase for entry in run.metrics()} == {"train"}
+        assert run.manifest.get("validation_clips", 0) == 0
+
+
+def test_a_search_needs_validation_clips(memmlp):
+    ran = memmlp("tune", *UNVALIDATED)
+    assert ran.code == 2
+    assert ran.err.startswith("memmlp: data.split.val: must be above 0 for a search")
+    assert ran.err.count("\n") == 1
