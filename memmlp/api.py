@@ -144,9 +144,10 @@ class TrainedRun(os.PathLike[str]):
     def results(self) -> dict[str, dict[str, dict[str, float]]]:
         """The mean results over the test clips: mode -> branch -> metric, in the units of `per_clip`.
 
-        If inverse kinematics of several kinds were evaluated, the branch "combined" is that of the run's
-        config, else the last one; `combined_by` says which. Raises InputError if a file of results is
-        damaged.
+        The branch "combined" has errors after inverse kinematics. If several kinds were evaluated, it has
+        the kind in the run's config, or else the last kind. `combined_by` names the kind.
+
+        Raises InputError if a result file is damaged.
         """
         return {
             mode: {branch: _numbers(errors) for branch, errors in branches.items()}
@@ -155,21 +156,21 @@ class TrainedRun(os.PathLike[str]):
 
     @property
     def combined_by(self) -> dict[str, str | None]:
-        """The inverse kinematics of the branch "combined", by mode, such as "arms" or "lbfgs-15".
+        """The kind of inverse kinematics in the branch "combined", by mode, such as "arms" or "lbfgs-15".
 
-        It is None where that is not known. Raises InputError if a file of results is damaged.
+        An unknown kind is None. Raises InputError if a result file is damaged.
         """
-        return self._run.evaluations_as_configured.combined_solvers
+        return self._run.configured_evaluations.combined_solvers
 
     def per_clip(self) -> pd.DataFrame:
         """Return a DataFrame with one row for each mode, branch and test clip.
 
-        Columns are run, seed, mode, branch, combined_by (which inverse kinematics the branch combined is by;
-        None for other branches), clip, group (clips of the same take or subject share a group),
-        frames at 60 Hz, and the metrics, whose units are in `.attrs["units"]`: MPJRE and geodesic in degrees
-        (NaN in the position branch), MPJPE and the other PE in cm, MPJVE in cm/s, Jitter in 10^2 m/s^3. Lower
-        is better, except for metrics of a package that says otherwise. For a network without a position
-        branch, that branch has the joints that follow from its rotations.
+        The columns are run, seed, mode, branch, combined_by (the kind of inverse kinematics; None for other
+        branches), clip, group (clips of the same take or subject share a group), the number of frames at
+        60 Hz, and the metrics. Their units are in `.attrs["units"]`: MPJRE and geodesic in degrees (NaN in
+        the position branch), MPJPE and the other PE in cm, MPJVE in cm/s, Jitter in 10^2 m/s^3. Lower is
+        better, except for custom metrics that declare the opposite. If a network has no position branch,
+        its position errors are the errors of the joints from its rotations.
 
         Raises:
             InputError: if pandas is not installed, or a file of results is damaged.
@@ -285,9 +286,9 @@ class Prediction:
         return len(self.true_positions)
 
     def errors(self, branch: Branch = "rotation") -> np.ndarray:
-        """Return each joint's distance from the truth (N, 22), cm; their mean is the clip's MPJPE.
+        """Return the distance of each predicted joint from the true joint (N, 22), cm.
 
-        Raises InputError for another branch, or one that the network does not have.
+        The mean is the clip's MPJPE. Raises InputError if the network does not have this branch.
         """
         return self._piece(branch).errors[branch]
 

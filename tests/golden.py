@@ -39,7 +39,7 @@ from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
 from memmlp.networks.constant_pose import ConstantPose, ConstantPoseSettings
 from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
+from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, MemoryWithoutCodes
 from memmlp.networks.predictor import (
     RotationOnlyMemorySettings,
     RotationOnlySettings,
@@ -116,7 +116,7 @@ def network(model: MotionModel) -> Numbers:
     torch.manual_seed(7)
     model.train()
     past, new = clip[:, : model.past_frames], clip[:, model.past_frames : model.past_frames + model.frames]
-    motion, _, terms = model.training_call(new[..., :SPARSE_DIM], model.true_state(past), new)
+    motion, _, terms = model.compute_training_outputs(new[..., :SPARSE_DIM], model.true_state(past), new)
     (motion.square().mean() + sum(terms.values(), torch.zeros(()))).backward()
     slopes = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
     found = summary("learned", motion) | summary("slopes", slopes)
@@ -155,7 +155,7 @@ def schedule(name: str) -> Numbers:
 
 def rollout(make: Callable[[], Rollout]) -> Numbers:
     """The calls of three steps, with the network's own motion."""
-    model, slot, split = tiny.model(NoCodesMemory), make(), frames()
+    model, slot, split = tiny.model(MemoryWithoutCodes), make(), frames()
     slot.begin(model)
     draws, found = WindowSampler(split, batch=2, window=7, seed=0), {}
     for step in range(3):
@@ -212,7 +212,7 @@ def measured() -> Numbers:
 
 def mode(name: str) -> Numbers:
     """The predictions of a mode for clips of unequal length, and the mean of their reports."""
-    model, split = tiny.model(NoCodesMemory), frames()
+    model, split = tiny.model(MemoryWithoutCodes), frames()
     found = {}
     for i, motion in enumerate(evaluation.MODE_FUNCTIONS[name](model, split.read_clips())):
         found |= summary(f"clip {i}", motion)
@@ -281,12 +281,12 @@ CASES: dict[str, Callable[[], Numbers]] = {
     **{
         f"memory.{name}": partial(lambda kind: network(tiny.model(kind)), kind)
         for name, kind in {
-            "vq": CodeMemory, "vq_joint": JointCodeMemory, "no_codes": NoCodesMemory, "lstm": LSTMMemory,
+            "vq": CodeMemory, "vq_joint": JointCodeMemory, "no_codes": MemoryWithoutCodes, "lstm": LSTMMemory,
             "gru": GRUMemory, "none": NoMemory,
         }.items()
     },
     **{
-        f"predictor.{name}": partial(lambda kind: network(tiny.model(NoCodesMemory, kind)), kind)
+        f"predictor.{name}": partial(lambda kind: network(tiny.model(MemoryWithoutCodes, kind)), kind)
         for name, kind in {
             "two_branch": TwoBranchSettings, "two_branch_memory": TwoBranchMemorySettings,
             "rotation_only": RotationOnlySettings, "rotation_only_memory": RotationOnlyMemorySettings,

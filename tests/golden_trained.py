@@ -87,7 +87,7 @@ class Line(MotionModel):
         inputs, kept = self.append_inputs(sparse, state)
         return self.map(inputs[:, -(newest or self.frames) :]), kept
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         return TrainingOutputs(*self.advance(sparse, state), {"own": self.map.bias.square().sum()})
 
 

@@ -146,7 +146,7 @@ def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, flo
         f"{prefix}ratio_to_avatar_poser": float(np.median(ratios)),
         f"{prefix}ratio_least": float(ratios.min()),
         f"{prefix}ratio_most": float(ratios.max()),
-        f"{prefix}core_share": float(times.core_shares.min()),
+        f"{prefix}core_share": float(times.core_fractions.min()),
     }
 
 
@@ -155,7 +155,8 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    print(f"milliseconds on one thread, {rounds} rounds in turn; x: ratio to AvatarPoser's network or pose")
+    print(f"milliseconds on one thread; each of {rounds} rounds times all networks")
+    print("x: the time divided by AvatarPoser's time, for the network or for the whole pose")
     print("core: minimum % of a round in which the thread had a core; below 90, the times are unreliable")
     table = Table(box=None, pad_edge=False)
     for name in ("network", "graph"):

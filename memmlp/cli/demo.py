@@ -48,7 +48,10 @@ def demo(overrides: tuple[str, ...]) -> None:
 
 
 def is_valid_for_recurrent_poser(overrides: Sequence[str]) -> bool:
-    """Return whether a demo's overrides do not choose a network and are valid for RecurrentPoser, too."""
+    """Return whether a demo with these overrides can also train RecurrentPoser.
+
+    It can if the overrides do not choose a network and are valid with RecurrentPoser.
+    """
     from memmlp.common.errors import InputError
     from memmlp.config.compose import compose_jobs, parse_hydra_arguments
 
@@ -78,12 +81,12 @@ def train_demo(overrides: Sequence[str]) -> list[Outcome]:
 def describe_next_steps(
     overrides: Sequence[str], environment: Path | None = None, runs: Sequence[str] = ()
 ) -> str:
-    """Return the commands to try next, with the demo's settings.
+    """Return commands that the user can try next, as a text.
 
     Args:
-        overrides: the demo's overrides; the run without a memory uses them, too.
-        environment: the folder of a virtual environment that this shell has not activated, or None.
-        runs: ids of the demo's runs; with two ids, the commands include drawing both networks.
+        overrides: the demo's overrides, to repeat in the commands.
+        environment: the folder of a virtual environment to activate first; None if none is needed.
+        runs: ids of the demo's runs. With two ids, the first command draws the motion of both networks.
     """
     command = shlex.join(["memmlp", "train", *overrides, "memory=none"])
     kept = [shlex.quote(word) for word in overrides if word.startswith(("profile=", "threads=", "device="))]

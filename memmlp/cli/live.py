@@ -263,7 +263,7 @@ def serve(options: LiveOptions) -> None:
             if source.has_wearer
             else None
         )
-        ask = fitting.submit_order if fitting else None
+        ask = fitting.submit_command if fitting else None
         with (
             finish_uninterrupted(outputs.close),
             page.LiveServer(hub, options.port, options.host, options.token, files, ask) as server,

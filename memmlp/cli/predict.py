@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--branch", type=click.Choice(["rotation", "combined", "truth"]),
-    help="Motion to write: the rotation branch, its rotations after inverse kinematics (combined), or the "
-    "true clip.  [default: combined with inverse kinematics, otherwise rotation]",
+    help="Motion to write. rotation: the network's rotations; combined: these rotations after inverse "
+    "kinematics; truth: the true motion.  [default: combined; rotation if inverse kinematics is off]",
 )  # fmt: skip
 @strict_option
 @device_option

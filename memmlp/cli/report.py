@@ -17,7 +17,7 @@ from memmlp.cli.options import outputs_option, plugins_option
     type=click.Path(path_type=Path, dir_okay=False),
     help="HTML file to write.  [default: report.html in --outputs]",
 )
-@click.option("--no-replays", is_flag=True, help="Leave out the 3D replays of the best runs' worst seconds.")
+@click.option("--no-replays", is_flag=True, help="Write a smaller file, without 3D replays of clips.")
 @plugins_option
 @outputs_option
 def report(sweeps: tuple[str, ...], out: Path | None, no_replays: bool, outputs: Path) -> None:

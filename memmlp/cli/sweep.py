@@ -127,11 +127,11 @@ def reset_runs(plan: Plan, failed: bool, networks: bool) -> None:
 def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
     """Start workers, and wait until they have finished the plan's runs."""
     from memmlp.config.compose_plan import get_sweep_folder
-    from memmlp.sweep.controller import oversee
+    from memmlp.sweep.controller import complete_plan
     from memmlp.sweep.progress_table import Board
 
     _, fleet = start_fleet(get_sweep_folder(chosen, plan.outputs), plan, workers, list_devices(plan))
-    oversee(plan, fleet, Board())
+    complete_plan(plan, fleet, Board())
 
 
 def list_devices(plan: Plan) -> set[str]:

@@ -64,20 +64,20 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         raise InputError("torchrun: several processes train one run; start it without --multirun")
     _check_prediction_folders(jobs)
     failures: list[Exception] = []
-    task = _collect_failures(job or run_training, failures)
+    train_from_config = _collect_failures(job or run_training, failures)
     keys = [override.key for override in parse_overrides(args.overrides)]
     has_hydra_keys = any(key.startswith(("hydra.", "hydra/")) for key in keys)
     if only_prints or args.multirun or args.config_name or has_hydra_keys:  # needs Hydra's launchers or keys
-        _run_with_hydra(args, task)
+        _run_with_hydra(args, train_from_config)
     else:
-        task(jobs[0])
+        train_from_config(jobs[0])
     for failure in failures[:-1]:
         print(f"memmlp: {failure}", file=sys.stderr)
     if failures:
         raise failures[-1]
 
 
-def _run_with_hydra(args: argparse.Namespace, task: Callable[[DictConfig], None]) -> None:
+def _run_with_hydra(args: argparse.Namespace, train_from_config: Callable[[DictConfig], None]) -> None:
     """Run or print the jobs with Hydra, which reads its arguments from `sys.argv`.
 
     Errors of Hydra are raised as InputError, with a message in one line.
@@ -88,7 +88,7 @@ def _run_with_hydra(args: argparse.Namespace, task: Callable[[DictConfig], None]
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv, os.environ["HYDRA_FULL_ERROR"] = ["memmlp train", *format_hydra_arguments(args)], "1"
     try:
-        main(task)()
+        main(train_from_config)()
     except Exception as error:
         if type(error).__module__.split(".")[0] in ("hydra", "omegaconf"):
             raise InputError(explain_error(error, args.overrides)) from error
@@ -124,7 +124,7 @@ def _collect_failures(
     """
     collector = os.getpid()
 
-    def task(cfg: DictConfig) -> None:
+    def train_from_config(cfg: DictConfig) -> None:
         try:
             job(cfg)
         except (InputError, TrainingDiverged, LeaseLost, OSError) as failure:
@@ -132,7 +132,7 @@ def _collect_failures(
                 raise
             failures.append(failure)
 
-    return task
+    return train_from_config
 
 
 def run_training(cfg: DictConfig) -> Outcome | None:

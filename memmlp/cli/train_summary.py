@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-from memmlp.common.processes import MIN_CORE_SHARE
+from memmlp.common.processes import MIN_CORE_FRACTION
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.measured_run import (
-    CORE_SHARES,
+    CORE_FRACTION_KEYS,
     SAME_ERROR_TOLERANCE,
     SHARED_METRIC,
     Errors,
@@ -120,7 +120,7 @@ def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
             f"{precision}: MPJPE {cost['growth']:+.1%}, Jitter {cost['jitter_growth']:+.1%}, more than "
             f"{MAX_GROWTH:.0%} and {MAX_JITTER_GROWTH:.0%}: memmlp live uses float32"
         )
-    if (share := min(measured.get(key, 1.0) for key in CORE_SHARES.values())) < MIN_CORE_SHARE:
+    if (share := min(measured.get(key, 1.0) for key in CORE_FRACTION_KEYS.values())) < MIN_CORE_FRACTION:
         yield format_warning(
             f"the machine was busy: a core was available {share:.0%} of the time, so the times are too long"
         )

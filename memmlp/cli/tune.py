@@ -80,9 +80,10 @@ class SearchSetup(NamedTuple):
     config_dir: Path | None
 
     def list_overrides(self, values: Mapping[str, Value]) -> list[str]:
-        """Return a trial's overrides: the search's base, the command line's, and the trial's values.
+        """Return a trial's overrides, for the trial's values.
 
-        Trials are judged only on validation clips. By default they are not exported and timed.
+        Overrides of the search file and of the command line come before the values. By default, trials are
+        neither exported nor timed. They are only evaluated on validation clips.
         """
         return ["export.graph=off", *self.search.base, *self.command_line, *self.search.overrides(values)]
 

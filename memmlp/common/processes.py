@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 
 GC_THRESHOLDS = (10_000, 20, 20)  # by default 700, 10 and 10
 
-MIN_CORE_SHARE = 0.9  # below this fraction of a core, other processes disturbed a measurement
+MIN_CORE_FRACTION = 0.9  # below this fraction of a core, other processes disturbed a measurement
 
 
 def collect_garbage_rarely() -> None:

@@ -38,7 +38,7 @@ def build_motion(cfg: DictConfig) -> MotionSource:
             not exist.
     """
     data = cfg.data
-    root, split = _build_clips(data)
+    root, split = _build_clip_request(data)
     generate: Callable[[Path], object] | None = None
     if data.synth is not None:
         settings = {str(key): value for key, value in data.synth.items() if key != "name"}
@@ -81,36 +81,36 @@ def read_source_weights(data: DictConfig) -> Mapping[str, float] | None:
     return weights if any(weights.values()) else None
 
 
-class _Clips(NamedTuple):
+class _ClipRequest(NamedTuple):
     """The folders of the clips, and the split."""
 
     root: Root
     split: Split
 
 
-def _build_clips(data: DictConfig) -> _Clips:
-    """Build the clips' folders and their split. Each source has a separate split."""
+def _build_clip_request(data: DictConfig) -> _ClipRequest:
+    """Return the folders and the split of the config. Each source has a separate split."""
     keys: dict[str, Any] = OmegaConf.to_container(data.split, resolve=True)  # type: ignore[assignment]
     if "kinds" in keys:
         keys["kinds"] = {name: Kind(**kind) for name, kind in keys["kinds"].items()}
     split: Any = SPLITS[keys.pop("name")](**keys)
     if sources := data.get("sources"):
         folders = NamedFolders({name: Path(source.root) for name, source in sources.items()})
-        own = {name: _build_source_split(split, name, source) for name, source in sources.items()}
-        return _Clips(folders, MixedSplit(own))
+        splits = {name: _build_source_split(split, name, source) for name, source in sources.items()}
+        return _ClipRequest(folders, MixedSplit(splits))
     roots = list(data.root) if OmegaConf.is_list(data.root) else [data.root]
     if len(roots) == 1:
-        return _Clips(Path(roots[0]), split)
+        return _ClipRequest(Path(roots[0]), split)
     folders = NamedFolders.from_paths([Path(root) for root in roots])
-    return _Clips(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
+    return _ClipRequest(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
 
 
 def _build_source_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
     """Return the split of a source, with the source's groups and fractions."""
-    own = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
+    fractions = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
     groups = [*split.groups, *(source.get("groups") or ())]
     try:
-        return replace(split, groups=groups, groups_file=source.get("groups_file"), **own)
+        return replace(split, groups=groups, groups_file=source.get("groups_file"), **fractions)
     except InputError as error:
         raise InputError(f"data.sources.{name}: {error}") from None
 

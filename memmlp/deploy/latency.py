@@ -36,11 +36,11 @@ class RoundTimes(NamedTuple):
 
     Attributes:
         seconds: the time of each step (rounds, steps), in seconds.
-        core_shares: the fraction of each round (rounds,) in which the thread ran on a core.
+        core_fractions: the fraction of each round (rounds,) in which the thread ran on a core.
     """
 
     seconds: np.ndarray
-    core_shares: np.ndarray
+    core_fractions: np.ndarray
 
 
 def measure_step_times(path: Path, steps: int = 200) -> dict[str, Any]:

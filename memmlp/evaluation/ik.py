@@ -240,10 +240,10 @@ def apply_inverse_hessian(gradient: Tensor, steps: list[Curvature]) -> Tensor:
 
 
 def estimate_initial_scale(gradient: Tensor, steps: list[Curvature]) -> Tensor:
-    """Return the factors (N,) by which the identity is scaled as the initial inverse Hessian.
+    """Return the scale (N,) of each row's initial inverse Hessian, which is a scaled identity.
 
-    The newest usable step of a row gives its factor. Without such a step, the factor limits the first step to
-    length 1.
+    The newest usable step of the row determines the scale. If a row has no usable step, the scale limits the
+    length of the first step to 1.
     """
     length = 1 / gradient.norm(dim=-1).clamp_min(1)
     for step in steps:

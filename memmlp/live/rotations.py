@@ -44,10 +44,7 @@ def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
 
 
 def rotate_by_fraction(matrix: np.ndarray, fraction: np.ndarray | float) -> np.ndarray:
-    """Return rotations (n, 3, 3) by a fraction of each angle (0 to pi), about the same axes.
-
-    `fraction` is one number or (n,).
-    """
+    """Multiply the angle (0 to pi) of each rotation (n, 3, 3) by `fraction`, () or (n,); keep the axis."""
     quaternion = matrix_to_quaternion(matrix)
     vector, w = quaternion[:, :3], quaternion[:, 3]
     sine = np.sqrt(np.einsum("ni,ni->n", vector, vector))

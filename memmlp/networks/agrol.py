@@ -160,8 +160,7 @@ class AGRoLDiffusionSettings(AGRoLMLPSettings):
     width: int = setting(at_least(2), tiny=16, small=128, paper=512, width_fraction=1)
     diffusion_steps: int = setting(at_least(1), 1000)  # number of steps in the cosine noise schedule
     sampling_steps: int = setting(at_least(1), 5)  # number of denoiser calls per window (DDIM)
-    # the seed of the initial noise of sampling; every window gets the same noise
-    noise_seed: int = setting(at_least(0), 0)
+    noise_seed: int = setting(at_least(0), 0)  # seed of the sampling noise, equal for all windows
 
     recipe: ClassVar = {"normalizer.z_scores": True}
 
@@ -214,7 +213,7 @@ class AGRoLDiffusion(WindowModel):
         noise = self.noise.expand(len(encoded), -1, -1)
         return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Add noise to the truth, and denoise it in one denoiser call; see MotionModel.
 
         A diffusion time is drawn for each window.

@@ -28,7 +28,7 @@ from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import StemGraph
-from memmlp.networks.transformer import EncoderLayer, draw_weights, make_encoder
+from memmlp.networks.transformer import EncoderLayer, initialize_weights, make_encoder
 
 JOINT_DIM = 18  # features of a joint: rotation, angular velocity, position, velocity
 UNTRACKED_FEATURE = 0.01  # stands in all features of joints without a tracker
@@ -169,7 +169,7 @@ class AvatarJLM(WindowModel):
             nn.LeakyReLU(0.1),
             nn.Linear(hidden, self.outputs),
         )
-        draw_weights(self)
+        initialize_weights(self)
 
     def place_coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coarse pose for embeddings (..., 2 d), in the network's coordinates without z-scores.
@@ -223,7 +223,7 @@ class AvatarJLM(WindowModel):
             h = self.restore_input_token(h, first)
         return self.regressor(h.flatten(-2).flatten(0, 1)).unflatten(0, encoded.shape[:2])
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the motion, and add a loss of the coarse pose; see MotionModel."""
         return TrainingOutputs(*self.advance(sparse, state), self.compute_coarse_loss(true_frames))
 

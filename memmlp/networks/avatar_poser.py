@@ -24,7 +24,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import NewestFrameModel, StreamingGraph
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import StemGraph
-from memmlp.networks.transformer import EncoderLayer, draw_weights, encode_newest_frame, make_encoder
+from memmlp.networks.transformer import EncoderLayer, encode_newest_frame, initialize_weights, make_encoder
 
 ROOT = 6  # components of the root's orientation, the first of the rotations
 
@@ -109,7 +109,7 @@ class AvatarPoser(NewestFrameModel):
         self.layers = make_encoder(settings, settings.depth)
         self.orientation = make_head(settings.width, ROOT)
         self.rotation = make_head(settings.width, 6 * self.rotated_joints)
-        draw_weights(self)
+        initialize_weights(self)
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.encode(self.embedding(encoded))

@@ -105,7 +105,7 @@ class BoDiffusionSettings(NetworkSettings):
     # number of denoiser calls per window; each call adds noise, except the last call and calls within the
     # last 50 steps of the schedule
     sampling_steps: int = setting(at_least(1), tiny=2, small=10, paper=25)
-    noise_seed: int = setting(at_least(0), 0)  # the seed of the sampling noise, which every window shares
+    noise_seed: int = setting(at_least(0), 0)  # seed of the sampling noise, equal for all windows
     noise_weight: float = setting(at_least(0), 1.0)  # weight of the loss for the predicted noise
     # weight of the variational bound, which trains the variances
     bound_weight: float = setting(positive(), 1.0)
@@ -222,7 +222,7 @@ class BoDiffusion(WindowModel):
         rotation = self.diffusion.sample(step, self.draw_noise(count).to(self.noises))
         return self.normalizer.decode_rotations(rotation, sparse)
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Add noise to the truth, and denoise it in one denoiser call; see MotionModel.
 
         A diffusion time is drawn for each window. The returned motion uses the noisy rotations without the

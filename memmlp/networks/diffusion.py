@@ -137,23 +137,24 @@ class DenoiserOutput(NamedTuple):
 
 
 def compute_posterior(signal: Tensor) -> Tensor:
-    """Return the coefficients of a denoising step to the previous signal (Ho et al. 2020, Eq. 7).
+    """Return mean coefficients and variances of the denoising steps (Ho et al. 2020, Eq. 7).
 
     Args:
-        signal: the signal's fraction (n,) of the noisy signal's variance, float64.
+        signal: the fraction (n,) of a noisy signal's variance that is due to the clean signal, at each
+            diffusion time, float64.
 
     Returns:
-        (4, n): the mean's coefficients for the clean and for the noisy signal, and the logarithms of the
-        smallest and of the largest variance. The first step's smallest variance would be 0, so it is replaced
-        by the second step's.
+        (4, n): coefficients of the clean and of the noisy signal in the mean, logarithms of the smallest and
+        of the largest variance. The smallest variance at the first time would be 0, so the variance at the
+        second time replaces it.
     """
-    before = torch.cat([torch.ones_like(signal[:1]), signal[:-1]])
-    added = 1 - signal / before
-    least = added * (1 - before) / (1 - signal)
-    least = torch.cat([least[1:2], least[1:]]) if len(signal) > 1 else added
-    clean = added * before.sqrt() / (1 - signal)
-    noisy = (1 - before) * (signal / before).sqrt() / (1 - signal)
-    return torch.stack([clean, noisy, least.log(), added.log()])
+    previous_signal = torch.cat([torch.ones_like(signal[:1]), signal[:-1]])
+    largest = 1 - signal / previous_signal
+    smallest = largest * (1 - previous_signal) / (1 - signal)
+    smallest = torch.cat([smallest[1:2], smallest[1:]]) if len(signal) > 1 else largest
+    clean = largest * previous_signal.sqrt() / (1 - signal)
+    noisy = (1 - previous_signal) * (signal / previous_signal).sqrt() / (1 - signal)
+    return torch.stack([clean, noisy, smallest.log(), largest.log()])
 
 
 class AncestralDiffusion(NoiseProcess):
@@ -211,13 +212,14 @@ class AncestralDiffusion(NoiseProcess):
         """
         noisy = self.add_noise(clean, time, noise)
         first, second, least, largest = look_up_at_times(self.trained, time, clean)
-        found = first * self.remove_noise(noisy, predicted.noise.detach(), time) + second * noisy
-        true = first * clean + second * noisy
+        predicted_mean = first * self.remove_noise(noisy, predicted.noise.detach(), time) + second * noisy
+        true_mean = first * clean + second * noisy
         log_variance = least + (predicted.variance_fraction + 1) / 2 * (largest - least)
         spread = log_variance - least
-        divergence = (spread + (-spread).exp() + (true - found).square() * (-log_variance).exp() - 1) / 2
-        surprise = compute_surprise(clean, found, log_variance, limits)
-        bound = torch.where(time.view_as(first) == 0, surprise, divergence)
+        difference = (true_mean - predicted_mean).square() * (-log_variance).exp()
+        divergence = (spread + (-spread).exp() + difference - 1) / 2
+        last_step_loss = compute_negative_log_likelihood(clean, predicted_mean, log_variance, limits)
+        bound = torch.where(time.view_as(first) == 0, last_step_loss, divergence)
         return (noise - predicted.noise).square().mean(), bound.mean() / math.log(2)
 
     def step(
@@ -251,7 +253,7 @@ class AncestralDiffusion(NoiseProcess):
         return x
 
 
-def compute_surprise(
+def compute_negative_log_likelihood(
     clean: Tensor, mean: Tensor, log_variance: Tensor, limits: tuple[Tensor, Tensor]
 ) -> Tensor:
     """Return the negative log likelihood of clean signals (B, ...) under a Gaussian, in nats (Ho et al.).

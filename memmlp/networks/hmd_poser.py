@@ -152,7 +152,7 @@ class HMDPoserGraph(FrameGraph):
     float32_modules = ("model.trackers", "model.hands", "model.others", "model.pose")
     model: HMDPoser
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
         features, kept = self.model.compute_features(sparse[None], state)
         return self.normalizer.decode_rotations(self.model.pose(features[0]), sparse), kept
 
@@ -248,7 +248,7 @@ class HMDPoser(WindowlessModel):
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.decode_rotations(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the motion, and add the loss of the predicted shape; see MotionModel."""
         features, kept = self.compute_features(sparse, state)
         losses = {}

@@ -49,7 +49,7 @@ from memmlp.networks.limb_solver import (
     solve_limbs,
 )
 from memmlp.networks.motion_model import MotionModel, State, TrainingOutputs
-from memmlp.networks.transformer import draw_weights
+from memmlp.networks.transformer import initialize_weights
 
 PREDICTED_JOINTS = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
 """The joints with predicted local rotations besides the root: trunk, shoulders and hips."""
@@ -83,14 +83,16 @@ class PredictedParts(NamedTuple):
     toe: Tensor
 
     @classmethod
-    def from_outputs(cls, made: Tensor, normalizer: Normalizer) -> PredictedParts:
+    def from_outputs(cls, outputs: Tensor, normalizer: Normalizer) -> PredictedParts:
         """Split a network's outputs (..., 86 or more) into parts."""
         chosen = [ROOT, *PREDICTED_JOINTS]
         mean, std = (
             part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[chosen]
             for part in (normalizer.mean, normalizer.std)
         )
-        rotations, swivel, ankle, toe = made[..., :PREDICTED_SIZE].split([6 * len(chosen), SWIVELS, 6, 6], -1)
+        rotations, swivel, ankle, toe = outputs[..., :PREDICTED_SIZE].split(
+            [6 * len(chosen), SWIVELS, 6, 6], -1
+        )
         return cls(
             rotations.unflatten(-1, (len(chosen), 6)) * std + mean,
             swivel.unflatten(-1, (2, -1)).transpose(-1, -2),
@@ -100,10 +102,10 @@ class PredictedParts(NamedTuple):
     @property
     def trunk(self) -> Tensor:
         """The local rotations (..., 22, 3, 3) of a body; joints without a prediction have the identity."""
-        found = sixd_to_matrix(self.sixd)
-        still = found.new_tensor(IDENTITY).expand(found[..., 0, :, :].shape)
-        rows = [still] * N_JOINTS
-        for joint, rotation in zip((ROOT, *PREDICTED_JOINTS), found.unbind(-3), strict=True):
+        rotations = sixd_to_matrix(self.sixd)
+        identity = rotations.new_tensor(IDENTITY).expand(rotations[..., 0, :, :].shape)
+        rows = [identity] * N_JOINTS
+        for joint, rotation in zip((ROOT, *PREDICTED_JOINTS), rotations.unbind(-3), strict=True):
             rows[joint] = rotation
         return torch.stack(rows, -3)
 
@@ -175,21 +177,21 @@ class Manikin(MotionModel):
         """Map windows (B, T, 54) in network space to outputs (B, n, 86 or more) for their last n frames."""
         raise NotImplementedError
 
-    def compute_part_losses(self, made: Tensor, true: TrueParts) -> dict[str, Tensor]:
+    def compute_part_losses(self, outputs: Tensor, true: TrueParts) -> dict[str, Tensor]:
         """Return the parts' losses for outputs (B, n, 86 or more), with the authors' weights."""
         raise NotImplementedError
 
-    def solve_pose(self, made: Tensor, encoded: Tensor) -> Tensor:
+    def solve_pose(self, outputs: Tensor, encoded: Tensor) -> Tensor:
         """Map outputs (..., 86 or more) and inputs (..., 54) of the same frames to rotations (..., 132).
 
         Limbs are always solved in float32.
         """
-        with use_float32(made.device):
-            return PredictedParts.from_outputs(made.to(encoded.dtype), self.normalizer).solve_pose(
+        with use_float32(outputs.device):
+            return PredictedParts.from_outputs(outputs.to(encoded.dtype), self.normalizer).solve_pose(
                 encoded, self.normalizer
             )
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the motion of windows turned by random headings, with losses; see MotionModel."""
         inputs, kept = self.append_inputs(sparse, state)
         angle = self.turned * 2 * math.pi * distributed.draw_rows(torch.rand_like, true_frames[:, :1, :1])
@@ -197,22 +199,24 @@ class Manikin(MotionModel):
         space = Heading()
         window = space.convert_inputs_to_local(inputs[:, -self.frames :], heading)
         encoded = self.normalizer.encode_sparse(window, self.normalizer.find_origin(window))
-        made = self.predict_parts(encoded)
-        count = made.shape[1]
-        rotation = self.solve_pose(made, encoded[:, -count:])
+        outputs = self.predict_parts(encoded)
+        count = outputs.shape[1]
+        rotation = self.solve_pose(outputs, encoded[:, -count:])
         motion = space.convert_motion_to_world(
             self.normalizer.decode_rotations(rotation, window[:, -count:]), heading
         )
         true = torch.cat([window, space.convert_motion_to_local(true_frames[..., SPARSE_DIM:], heading)], -1)
-        return TrainingOutputs(motion, kept, self.compute_losses(made, true))
+        return TrainingOutputs(motion, kept, self.compute_losses(outputs, true))
 
-    def compute_losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
+    def compute_losses(self, outputs: Tensor, true: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of outputs (B, n, 86 or more), given true world frames (B, T, 252)."""
         motion = self.normalizer.coordinates.convert_motion_to_local(
             true[..., SPARSE_DIM:], self.normalizer.find_origin(true[..., :SPARSE_DIM])
         )
-        with use_float32(made.device):
-            parts = self.compute_part_losses(made.to(true.dtype), TrueParts(motion[:, -made.shape[1] :]))
+        with use_float32(outputs.device):
+            parts = self.compute_part_losses(
+                outputs.to(true.dtype), TrueParts(motion[:, -outputs.shape[1] :])
+            )
         return {name: self.parts_weight * term for name, term in parts.items()}
 
 
@@ -258,7 +262,7 @@ class ManikinS(Manikin, AvatarPoser):
         self.parts_weight, self.turned = settings.parts_weight, settings.turned
         self.swivel, self.places = make_head(settings.width, SWIVELS), make_head(settings.width, PLACES)
         for added in (self.swivel, self.places):
-            draw_weights(added)
+            initialize_weights(added)
 
     def read(self, newest: Tensor) -> Tensor:
         """Map the newest frame's feature (..., d) to outputs (..., 86)."""
@@ -271,14 +275,14 @@ class ManikinS(Manikin, AvatarPoser):
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.solve_pose(self.predict_parts(encoded), encoded[:, -1:])[:, 0]
 
-    def compute_part_losses(self, made: Tensor, true: TrueParts) -> dict[str, Tensor]:
+    def compute_part_losses(self, outputs: Tensor, true: TrueParts) -> dict[str, Tensor]:
         """Return the parts' losses for outputs (B, 1, 86), with the authors' weights.
 
         Swivels are measured relative to the predicted shoulders and hips, without a gradient to them. That
         gradient has no bound if a limb is nearly parallel to its reference axis, like a standing leg, and
         training diverged. The losses of middles and swivels are sums over the limbs.
         """
-        parts = PredictedParts.from_outputs(made, self.normalizer)
+        parts = PredictedParts.from_outputs(outputs, self.normalizer)
         _, turned, joints = parts.pose_body(self.normalizer.rest)
         base, middle, end = true.list_limb_joints()
         up, angle = turned[..., list(BASES), :, 1].detach(), F.normalize(parts.swivel, dim=-1)
@@ -300,8 +304,8 @@ class ManikinLGraph(AvatarJLMGraph):
 
     model: ManikinL
 
-    def read(self, made: Tensor, encoded: Tensor) -> Tensor:
-        return self.model.solve_pose(made, encoded)
+    def read(self, outputs: Tensor, encoded: Tensor) -> Tensor:
+        return self.model.solve_pose(outputs, encoded)
 
 
 @component("model", "manikin_l", version=2, builds="ManikinL")
@@ -346,17 +350,17 @@ class ManikinL(Manikin, AvatarJLM):
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.solve_pose(self.predict_parts(encoded), encoded)
 
-    def compute_losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
+    def compute_losses(self, outputs: Tensor, true: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of the parts and of the coarse pose; see Manikin."""
-        return super().compute_losses(made, true) | self.compute_coarse_loss(true)
+        return super().compute_losses(outputs, true) | self.compute_coarse_loss(true)
 
-    def compute_part_losses(self, made: Tensor, true: TrueParts) -> dict[str, Tensor]:
+    def compute_part_losses(self, outputs: Tensor, true: TrueParts) -> dict[str, Tensor]:
         """Return the parts' losses for outputs (B, T, 212), with the authors' weights.
 
         Swivels are compared as angles relative to the true shoulders and hips. Toes are compared with the
         head on its tracker.
         """
-        parts = PredictedParts.from_outputs(made, self.normalizer)
+        parts = PredictedParts.from_outputs(outputs, self.normalizer)
         turned, _ = forward_kinematics(
             sixd_to_matrix(true.sixd), torch.zeros_like(true.joints[..., ROOT, :]), self.normalizer.rest
         )
@@ -369,5 +373,5 @@ class ManikinL(Manikin, AvatarJLM):
             "swivel": 0.1 * torch.atan2(y * cosine - x * sine, x * cosine + y * sine).abs().mean(),
             "ankle": 5 * F.l1_loss(parts.ankle, true.compute_vectors((HEAD,), ANKLES)),
             "toe": 5 * F.l1_loss(parts.ankle + parts.toe, toe),
-            "auxiliary": 2 * F.l1_loss(made[..., PREDICTED_SIZE:], true.sixd[..., 1:, :].flatten(-2)),
+            "auxiliary": 2 * F.l1_loss(outputs[..., PREDICTED_SIZE:], true.sixd[..., 1:, :].flatten(-2)),
         }

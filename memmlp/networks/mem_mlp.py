@@ -140,16 +140,16 @@ class MemMLPGraph(StreamingGraph):
             **memory.initial_state(1),
         }
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
         memory = self.recall.memory
         origin = self.normalizer.find_origin(sparse)
         encoded = self.conversions.encode_sparse(sparse, origin)
-        queue = torch.cat([fill_past(state["sparse"], encoded, fresh), encoded[None]], 1)
+        queue = torch.cat([fill_past(state["sparse"], encoded, is_first_step), encoded[None]], 1)
         past = memory.recall(queue, state, 1)
         stem = self.stem(encoded)
-        kept = {"stem": slide_window(state["stem"], stem, stem, fresh)}
+        kept = {"stem": slide_window(state["stem"], stem, stem, is_first_step)}
         for name, contribution, before in zip(self.contributions, *self.recall(past), strict=True):
-            kept[name] = slide_window(state[name], contribution, before, fresh)
+            kept[name] = slide_window(state[name], contribution, before, is_first_step)
         h, *contributions = kept.values()
         for block in self.blocks:
             h = block(h, contributions)
@@ -301,7 +301,7 @@ class MemMLP(MotionModel):
         kept |= self.memory.remember(motion, past, state, new)
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the motion; a jointly trained VQ-VAE adds its losses."""
         motion, kept = self.advance(sparse, state)
         return TrainingOutputs(motion, kept, self.memory.auxiliary_losses(true_frames, self.normalizer))

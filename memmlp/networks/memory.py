@@ -341,7 +341,10 @@ class RecurrentMemory(FeatureMemory):
         return {"hidden": torch.stack(hidden, 1).float()}
 
     def recall(self, sparse: Tensor, state: State, new: int) -> RecurrentPast:
-        """Run the layers over the last `new` inputs of (B, past + new, 54), and return the window."""
+        """Run the recurrent layers over the new frames; see Memory.
+
+        The result has the features of the last T frames, and the layers' states after the newest frame.
+        """
         features, states = [], []
         for index, recurrence in enumerate(self.recurrences):
             made, after = recurrence(sparse[:, -new:], [state[name][:, index] for name in self.carried])

@@ -15,7 +15,7 @@ State = dict[str, Tensor]
 
 
 class TrainingOutputs(NamedTuple):
-    """The results of `MotionModel.training_call`.
+    """The results of `MotionModel.compute_training_outputs`.
 
     Attributes:
         motion: world motion (B, n, 198) for comparison with the true motion of the window's last n frames. An
@@ -89,8 +89,8 @@ class MotionModel(nn.Module):
 
     def running_state(self, sparse: Tensor) -> State:
         """Return the state after world inputs (B, past, 54), without a history of motion."""
-        fresh = self.initial_state(len(sparse))
-        return fresh | {"sparse": sparse, "started": torch.ones_like(fresh["started"])}
+        initial = self.initial_state(len(sparse))
+        return initial | {"sparse": sparse, "started": torch.ones_like(initial["started"])}
 
     def true_state(self, frames: Tensor) -> State:
         """Return the state after world frames [X | Theta] (B, past, 252), with true history."""
@@ -125,7 +125,7 @@ class MotionModel(nn.Module):
         """Map a clip's world inputs (N, 54), N >= T, to its world motion (N, 198); see `takes_whole_clip`."""
         raise NotImplementedError
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the motion for a training step, with additional losses; by default this is `advance`.
 
         Args:
@@ -219,7 +219,7 @@ class NewestFrameModel(MotionModel):
         return self.normalizer.decode_rotations(rotation, inputs[:, -wanted:]), kept
 
 
-def fill_past(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
+def fill_past(earlier: Tensor, first: Tensor, is_first_step: Tensor) -> Tensor:
     """Return a window's earlier frames; in a stream's first step they are copies of the first frame.
 
     In the first step the carried frames are zeros, so a sum is enough. Not every runtime has conditions.
@@ -227,17 +227,17 @@ def fill_past(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
     Args:
         earlier: the carried frames (n, size).
         first: the frame that replaces earlier frames (1, size).
-        fresh: 1 in a stream's first step, else 0 (1,).
+        is_first_step: 1 in a stream's first step, else 0 (1,).
     """
-    return earlier + fresh * first
+    return earlier + is_first_step * first
 
 
-def slide_window(window: Tensor, entering: Tensor, before: Tensor, fresh: Tensor) -> Tensor:
+def slide_window(window: Tensor, entering: Tensor, before: Tensor, is_first_step: Tensor) -> Tensor:
     """Return a window (T, size) without its oldest frame, and with a new last frame (1, size).
 
     In a stream's first step `before` (1, size) replaces all earlier frames; see `fill_past`.
     """
-    return torch.cat([fill_past(window[1:], before, fresh), entering])
+    return torch.cat([fill_past(window[1:], before, is_first_step), entering])
 
 
 class StreamingGraph(nn.Module):
@@ -298,18 +298,18 @@ class StreamingGraph(nn.Module):
         """
         # An exported graph has no empty inputs, so empty parts of the state (a queue of 0 frames) are dropped
         # from the new state and put back from `windows` here.
-        fresh = 1 - state["count"].clamp_max(1)
-        motion, kept = self.step(sparse[0], self.windows() | state, fresh)
+        is_first_step = 1 - state["count"].clamp_max(1)
+        motion, kept = self.step(sparse[0], self.windows() | state, is_first_step)
         kept["count"] = state["count"].clamp_max(self.frames - 1) + 1  # stops at T
         return motion[None], {name: tensor for name, tensor in kept.items() if tensor.numel()}
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
         """Process one frame.
 
         Args:
             sparse: world inputs (1, 54).
             state: the state, initially zeros.
-            fresh: 1 in a stream's first step, else 0 (1,).
+            is_first_step: 1 in a stream's first step, else 0 (1,).
 
         Returns:
             World motion (1, 198), and the new state.
@@ -329,6 +329,6 @@ class FrameGraph(StreamingGraph):
         """Return the network's initial state, because it does not have a window."""
         return self.model.initial_state(1)
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
         motion, kept = self.model.advance(sparse[None], state, 1)
         return motion[0], kept

@@ -167,11 +167,11 @@ class OwnPastRecall(Recall):
 
 @dataclass
 class OwnPastMemorySettings(FeatureMemorySettings):
-    """The keys of the memories of the network's own past.
+    """Keys of memories that recall the network's own earlier motion.
 
     Attributes:
-        codes: "frozen" for a VQ-VAE trained before the network, "joint" for a VQ-VAE trained with the
-            network, "" without a VQ-VAE.
+        codes: "frozen" if the VQ-VAE is trained before the network, "joint" if both are trained together, ""
+            without a VQ-VAE.
     """
 
     # window: the past window ends T frames ago; frame: it ends one frame ago (docs/readings.md, no. 6)
@@ -185,16 +185,16 @@ class OwnPastMemorySettings(FeatureMemorySettings):
     codes: ClassVar[str] = ""
 
 
-@component("memory", "no_codes", builds="NoCodesMemory")
+@component("memory", "no_codes", builds="MemoryWithoutCodes")
 @dataclass
-class NoCodesMemorySettings(OwnPastMemorySettings):
-    """A memory of the network's own past without code-vectors (Table 11)."""
+class MemoryWithoutCodesSettings(OwnPastMemorySettings):
+    """A memory of the network's own earlier motion, without code-vectors (Table 11)."""
 
 
 @component("memory", "vq", builds="CodeMemory")
 @dataclass
 class CodeMemorySettings(OwnPastMemorySettings):
-    """The paper's memory: code-vectors and the network's own past (Sec. 3.2.1)."""
+    """The paper's memory: code-vectors and the network's own earlier motion (Sec. 3.2.1)."""
 
     codes: ClassVar[str] = "frozen"
 
@@ -202,7 +202,7 @@ class CodeMemorySettings(OwnPastMemorySettings):
 @component("memory", "vq_joint", builds="JointCodeMemory")
 @dataclass
 class JointCodeMemorySettings(OwnPastMemorySettings):
-    """Like vq, but the VQ-VAE is trained from scratch with the network (App. A), by an unweighted loss.
+    """Like vq, but the VQ-VAE is trained together with the network, with an unweighted loss (App. A).
 
     The VQ-VAE does not have its own run, so vqvae.steps, epochs, batch, lr and weight_decay have no effect.
     """
@@ -211,7 +211,7 @@ class JointCodeMemorySettings(OwnPastMemorySettings):
 
 
 class OwnPastMemory(FeatureMemory):
-    """The base class of memories of the network's own past, with and without code-vectors.
+    """The base class of memories that recall the network's own earlier motion.
 
     Set `memory.blend.value` to change m in a trained network.
 
@@ -241,9 +241,10 @@ class OwnPastMemory(FeatureMemory):
         return self.frames if self.history == "latest" else new
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Past:
-        """Recall the T frames that end one shift before the newest frame; see Memory.
+        """Recall T past frames; see Memory.
 
-        If necessary, the frames end earlier, just before the first new frame."""
+        They end `shift` frames before the newest frame, but at the latest just before the first new frame.
+        """
         # The buffers begin T + shift - 1 frames before the first new one, so the window begins at new - 1,
         # but not after shift - 1: the motion of the new frames is not known yet.
         start = min(new, self.shift) - 1
@@ -262,8 +263,8 @@ class OwnPastMemory(FeatureMemory):
         return {"motion": buffer}
 
 
-class NoCodesMemory(OwnPastMemory):
-    """A memory of the network's own past without code-vectors (Table 11)."""
+class MemoryWithoutCodes(OwnPastMemory):
+    """A memory of the network's own earlier motion, without code-vectors (Table 11)."""
 
     def make_feature(self) -> nn.Module:
         return PastFeature(self.width, None, self.blend)
@@ -274,7 +275,7 @@ class NoCodesMemory(OwnPastMemory):
 
 
 class VQMemory(OwnPastMemory):
-    """A memory of the network's own past with code-vectors (Sec. 3.2.1), from any kind of VQ-VAE.
+    """A memory of the network's own earlier motion with code-vectors, from any kind of VQ-VAE (Sec. 3.2.1).
 
     Each frame of the past window has one code-vector for all memory blocks (docs/readings.md, no. 4).
     """

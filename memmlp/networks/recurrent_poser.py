@@ -255,7 +255,7 @@ class RecurrentPoserGraph(FrameGraph):
             float32 += [f"model.members.{name}.{part}" for part in parts]
         self.float32_modules = tuple(float32)
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
         made, kept = self.model.predict_members(sparse, state)
         return self.model.pose(made.mean(0), sparse), kept
 
@@ -374,7 +374,7 @@ class RecurrentPoser(WindowlessModel):
         start = sparse.shape[1] - (sparse.shape[1] if newest is None else newest)
         return self.pose(made[:, :, start:].mean(0), sparse[:, start:]), kept
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Return each member's motion, one after the other (members x B, T, 198); see MotionModel.
 
         The arms do not reach for the trackers here. Losses after reaching gave larger errors of rotations and

@@ -68,8 +68,8 @@ class RefinedGraph(StreamingGraph):
         """Return zeros for the state of the network's graph, and for the hidden state (1, depth, width)."""
         return {**self.graph.windows(), HIDDEN: self.hidden}
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        motion, kept = self.graph.step(sparse, state, fresh)
+    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
+        motion, kept = self.graph.step(sparse, state, is_first_step)
         refined, hidden = self.model.refine(motion[None], sparse[None], state[HIDDEN])
         return refined[0], {**kept, HIDDEN: hidden}
 

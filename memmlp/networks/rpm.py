@@ -166,7 +166,7 @@ class RPM(WindowlessModel):
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.decode_rotations(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Run over a few frames without gradients, then predict with gradients; see MotionModel.
 
         The number of frames without gradients is random. The last step predicts the window's last W frames.

@@ -154,7 +154,7 @@ class SAGESettings(NetworkSettings):
     diffusion_steps: int = setting(at_least(1), 1000)  # number of steps in the noise schedule
     sampling_steps: int = setting(at_least(1), 5)  # number of calls of each diffusion model per pose
     noise: float = setting(at_least(0), 0.01)  # standard deviation of the initial noise of sampling
-    noise_seed: int = setting(at_least(0), 0)  # the seed of this noise; every window gets the same noise
+    noise_seed: int = setting(at_least(0), 0)  # seed of the sampling noise, equal for all windows
 
     learns_newest_frame: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "sage", "prerequisite": "sage"}
@@ -216,6 +216,6 @@ class SAGENet(NewestFrameModel):
         upper = self.sample_upper(encoded)
         return self.decoder(upper, self.sample_lower(upper, encoded), encoded)[:, -1]
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the newest frame through both samplers; see MotionModel."""
         return TrainingOutputs(*self.advance(sparse, state, 1), {})

@@ -188,10 +188,10 @@ class StemGraph(StreamingGraph):
         """Return zeros (T - 1, d) for the carried values of earlier frames, oldest first."""
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
         entering = self.embed_frame(encoded)
-        window = torch.cat([fill_past(state["stem"], entering, fresh), entering])
+        window = torch.cat([fill_past(state["stem"], entering, is_first_step), entering])
         return self.normalizer.decode_rotations(self.predict_rotation(window, encoded), sparse), {
             "stem": window[1:]
         }

@@ -90,8 +90,8 @@ def make_encoder(settings: Any, depth: int, activation: Callable[[Tensor], Tenso
 
 
 @torch.no_grad()
-def draw_weights(part: nn.Module) -> None:
-    """Draw the initial weights of linear layers like AvatarPoser's released code.
+def initialize_weights(part: nn.Module) -> None:
+    """Initialize the weights of linear layers like AvatarPoser's released code.
 
     They have Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2, so that initial outputs are
     small: near the mean pose with z-scores. Biases are 0. The released code keeps torch's initial biases

@@ -95,7 +95,7 @@ class VAEHMDGraph(FrameGraph):
     float32_modules = ("model.encoder.stem", "model.decoder.head")
     model: VAEHMD
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) to world motion (1, 198); no state is carried."""
         mean = self.model.encode(sparse).chunk(2, -1)[0]
         return self.normalizer.decode_rotations(self.model.decoder(mean), sparse), {}
@@ -153,7 +153,7 @@ class VAEHMD(WindowlessModel):
         seen = sparse if newest is None else sparse[:, -newest:]
         return self.normalizer.decode_rotations(self.decoder(self.encode(seen).chunk(2, -1)[0]), seen), state
 
-    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+    def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Decode each window either from its true poses or from its trackers; see MotionModel.
 
         The additional loss is the latents' KL divergence.

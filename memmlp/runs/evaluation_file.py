@@ -112,12 +112,12 @@ def _remove_combined(report: Mapping[str, Any]) -> dict[str, Any]:
     return {**report, "mean": mean, "clips": clips}
 
 
-def name_solvers(results: Mapping[str, Any], solvers: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return results with the branch `combined` renamed after its solver, such as "combined-lbfgs-15".
+def add_solver_names(results: Mapping[str, Any], solvers: Mapping[str, str | None]) -> dict[str, Any]:
+    """Add the solver's name to the branch `combined`, such as "combined-lbfgs-15".
 
     Args:
         results: results by mode and branch; other entries are kept.
-        solvers: the inverse kinematics by mode (`find_combined_solvers`).
+        solvers: the inverse kinematics solvers by mode (`find_combined_solvers`).
     """
 
     def rename(mode: str, branch: str) -> str:
@@ -135,7 +135,7 @@ def _compute_content_digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-class EvaluationsAsConfigured:
+class ConfiguredEvaluations:
     """A run's evaluations that match the run's config.
 
     Attributes:

@@ -287,7 +287,7 @@ def select_training_config(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def affects_training(key: str, config: Mapping[str, Any]) -> bool:
-    """Return whether a dotted key can affect the training with this config, or its data."""
+    """Return whether a dotted key of this config can change the training or the data."""
     return key.startswith("data.") or any(_is_below(name, [key]) for name in select_training_config(config))
 
 

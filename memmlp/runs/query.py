@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.files import to_number
 from memmlp.runs.deployment_folder import replace_with_deployed_times
-from memmlp.runs.evaluation_file import name_solvers
+from memmlp.runs.evaluation_file import add_solver_names
 from memmlp.runs.identity import SLOTS, find_option, flatten, select_training_config
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.run import STATUSES, Run
@@ -43,7 +43,7 @@ def build_record(run: Run) -> dict[str, Any]:
       in the key: `latency-int8.median_ms`.
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    named = name_solvers(run.results, run.evaluations_as_configured.combined_solvers)
+    named = add_solver_names(run.results, run.configured_evaluations.combined_solvers)
     results = {key: to_number(value) for key, value in flatten(replace_with_deployed_times(named)).items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
@@ -152,8 +152,8 @@ class Query(NamedTuple):
     keys: tuple[str, ...]
     numbers: tuple[str, ...]
 
-    def test_records(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
-        """Return whether the condition holds, for each record.
+    def match_records(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
+        """Return, for each record, whether it satisfies the condition.
 
         Raises:
             InputError: if a key is unknown, or if a key in `numbers` has text values only.

@@ -30,7 +30,7 @@ from memmlp.runs.environment import (
     list_changed_files,
     merge_run_origins,
 )
-from memmlp.runs.evaluation_file import EvaluationsAsConfigured, is_intact
+from memmlp.runs.evaluation_file import ConfiguredEvaluations, is_intact
 from memmlp.runs.identity import (
     belongs_to_folder,
     describe_export_difference,
@@ -231,7 +231,7 @@ class Run:
 
     @property
     def activity(self) -> str | None:
-        """The activity of the process that works on the run (STAGE_WORDS); None without such a process."""
+        """The current activity: training, evaluating or exporting; None if no process works on the run."""
         if not self._lock.is_held:
             return None
         attempts = self.manifest.get("attempts") or [{}]
@@ -367,15 +367,15 @@ class Run:
         Raises:
             InputError: if an evaluation file is damaged.
         """
-        results = read_json(self.results_path) | self.evaluations_as_configured.results
+        results = read_json(self.results_path) | self.configured_evaluations.results
         config = self.config
         deployed = self.find_shown_deployment(config)
         return results | ({name_latency(deployed, config): deployed.record} if deployed.record else {})
 
     @property
-    def evaluations_as_configured(self) -> EvaluationsAsConfigured:
+    def configured_evaluations(self) -> ConfiguredEvaluations:
         """The evaluations that match the config of the run; each access reads the files."""
-        return EvaluationsAsConfigured(self.evaluations, self.config)
+        return ConfiguredEvaluations(self.evaluations, self.config)
 
     @property
     def changed_sources(self) -> list[str]:

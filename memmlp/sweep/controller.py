@@ -11,7 +11,7 @@ from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import Board
 from memmlp.sweep.worker import Presence
 
-LOOK = 0.5  # seconds between two reads of the run folders
+READ_INTERVAL = 0.5  # seconds between two reads of the run folders
 MIN_LIFETIME = 20.0  # seconds; a worker that ends sooner has failed to start
 MAX_FAILED_STARTS = 5  # the maximum number of failed starts in a row, per worker of the fleet
 
@@ -41,11 +41,11 @@ class Fleet:
         self.failed_starts = 0
         self.complaint: str | None = None
 
-    def maintain(self, count: int) -> None:
-        """Start workers until `count` of them, or at most the fleet's size, are alive.
+    def keep_workers_running(self, count: int) -> None:
+        """Start workers until `count` are running; the fleet's size is the maximum.
 
         Raises:
-            InputError: if too many workers in a row end as soon as they are started.
+            InputError: if too many workers in a row end soon after their start.
         """
         now = time.monotonic()
         living = []
@@ -71,21 +71,20 @@ class Fleet:
                 handle.cancel()
 
 
-def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
-    """Keep the fleet working on the plan until no task remains.
+def complete_plan(plan: Plan, fleet: Fleet, board: Board) -> None:
+    """Keep the fleet working on the plan until all its tasks are done.
 
-    It also waits for runs on which other sweeps' workers are working. If this process is interrupted, the
-    workers are ended.
+    Other sweeps' workers may do some of the tasks; the function waits for these tasks, too. If this process
+    is interrupted, it ends its workers.
 
-    Finished runs are read again only when no task seems to remain. This spares the disk, because a sweep may
-    have many runs.
+    Finished runs are read again only when no task seems to remain, because a sweep may have many runs.
     """
     try:
         with board:
             board.update(plan, states := plan.read_states())
-            while left := plan.list_remaining(states) or plan.list_remaining(states := plan.read_states()):
-                fleet.maintain(len(left))
-                time.sleep(LOOK)
+            while tasks := plan.list_remaining(states) or plan.list_remaining(states := plan.read_states()):
+                fleet.keep_workers_running(len(tasks))
+                time.sleep(READ_INTERVAL)
                 board.update(plan, states := plan.read_states(states))
     except BaseException:
         fleet.cancel()

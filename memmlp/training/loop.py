@@ -79,20 +79,20 @@ ValidationCallback = Callable[[int, dict[str, float]], None]
 
 def train(
     task: TrainingTask,
-    optim: Optim,
+    settings: Optim,
     run: Run,
     seed: int,
     description: str,
     on_validation: ValidationCallback | None = None,
 ) -> None:
-    """Train until step `optim.steps`, starting from the run's checkpoint if there is one.
+    """Train until step `settings.steps`, starting from the run's checkpoint if there is one.
 
     The last checkpoint stays in the run's folder. The module is left with the final weights, which may be an
     average over steps.
 
     Args:
         task: what to train.
-        optim: steps, learning rates and intervals.
+        settings: steps, learning rates and intervals.
         run: the run; its folder receives checkpoints and the metrics log.
         seed: the seed of all steps.
         description: label of the progress bar.
@@ -102,22 +102,24 @@ def train(
         TrainingDiverged: if the loss is NaN or infinite.
         InputError: if several processes would not give the same result as one process.
     """
-    check_processes(task, optim, description)
-    optimiser = optim.build(task.parameter_groups())
-    average = optim.make_average(task.module, optimiser)
+    check_processes(task, settings, description)
+    optimiser = settings.build(task.parameter_groups())
+    average = settings.make_average(task.module, optimiser)
     start, spent = resume(task, optimiser, average, run)
     started = time.monotonic() - spent
     if start and distributed.is_first():
-        notify(f"{description}: resumes from the last checkpoint, at step {start} of {optim.steps}")
+        notify(f"{description}: resumes from the last checkpoint, at step {start} of {settings.steps}")
     distributed.copy_from_first(task.module)
-    with show_progress(description, optim.steps, start, shown=distributed.is_first(), unit="steps") as count:
-        for step in range(start, optim.steps):
+    with show_progress(
+        description, settings.steps, start, shown=distributed.is_first(), unit="steps"
+    ) as count:
+        for step in range(start, settings.steps):
             seed_step(seed, step)
-            result = train_step(task, optim, optimiser, step)
+            result = train_step(task, settings, optimiser, step)
             average.update(step + 1)
             first = distributed.is_first()
-            validation = record(task, optim, average, run, step + 1, result, count) if first else {}
-            if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
+            validation = record(task, settings, average, run, step + 1, result, count) if first else {}
+            if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
                 save(task, optimiser, average, run, step + 1, time.monotonic() - started)
             if validation and on_validation:
                 on_validation(step + 1, validation)
@@ -126,45 +128,47 @@ def train(
     average.write_into_module()
 
 
-def check_processes(task: TrainingTask, optim: Optim, description: str) -> None:
+def check_processes(task: TrainingTask, settings: Optim, description: str) -> None:
     """Raise InputError if several processes cannot share a batch with the same result as one process."""
     count = distributed.world_size()
-    if optim.batch % count:
+    if settings.batch % count:
         raise InputError(
-            f"optim.batch or vqvae.batch={optim.batch}: must be a multiple of the number of processes, "
+            f"optim.batch or vqvae.batch={settings.batch}: must be a multiple of the number of processes, "
             f"{count} ({description})"
         )
     if count > 1 and (names := layers.find_batch_dependent_layers(task.module)):
         raise InputError(
-            f"{description}: must not use {', '.join(names)} with {count} processes, since each would "
-            "draw or count separately; use layers that treat rows separately, and "
+            f"{description}: must not use {', '.join(names)} with {count} processes, because the result for "
+            "a row would depend on the other rows of its process; for dropout, use "
             "memmlp.networks.layers.Dropout"
         )
 
 
-def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimizer, step: int) -> StepResult:
+def train_step(
+    task: TrainingTask, settings: Optim, optimiser: torch.optim.Optimizer, step: int
+) -> StepResult:
     """Take one step of the optimiser."""
     task.module.train()
     for group in optimiser.param_groups:
         group.setdefault("initial_lr", group["lr"])
-        group["lr"] = group["initial_lr"] * optim.compute_factor(step)
+        group["lr"] = group["initial_lr"] * settings.compute_factor(step)
     device = task.dataset.frames.device
-    mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
+    mixed = torch.autocast(device.type, torch.bfloat16) if settings.precision == "bf16" else nullcontext()
     with mixed, distributed.split_batch():
         result = task.step(step)
-        seen = gather_batch(result)
-    check_finite(task, seen, step)
+        gathered = gather_step_result(result)
+    check_finite(task, gathered, step)
     optimiser.zero_grad(set_to_none=True)
     result.loss.backward()
     distributed.average_gradients(task.module.parameters())
-    if optim.clip_norm:
-        torch.nn.utils.clip_grad_norm_(task.module.parameters(), optim.clip_norm)
+    if settings.clip_norm:
+        torch.nn.utils.clip_grad_norm_(task.module.parameters(), settings.clip_norm)
     optimiser.step()
-    return seen
+    return gathered
 
 
-def gather_batch(result: StepResult) -> StepResult:
-    """Average loss and terms of a batch over the processes that share it, and gather its clips."""
+def gather_step_result(result: StepResult) -> StepResult:
+    """Return the result for the whole batch: mean loss and terms of all processes, and all clips."""
     if not distributed.is_batch_split():
         return result
     terms = torch.stack([result.loss, *result.terms.values()])
@@ -188,7 +192,7 @@ def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
 
 def record(
     task: TrainingTask,
-    optim: Optim,
+    settings: Optim,
     average: Average,
     run: Run,
     step: int,
@@ -196,14 +200,14 @@ def record(
     count: ProgressCounter,
 ) -> dict[str, float]:
     """Log and show a finished step; return the validation's values, or {} without a validation."""
-    last = step == optim.steps
-    if step % optim.log_every == 0 or last:
+    last = step == settings.steps
+    if step % settings.log_every == 0 or last:
         loss = float(result.loss.detach())
         terms = {name: float(term.detach()) for name, term in result.terms.items()}
         run.log(step, {"loss": loss, **terms, **task.report()})
         count.set_note(f"loss {loss:.3g}")
     count.advance()
-    if step % optim.validate_every == 0 or last:
+    if step % settings.validate_every == 0 or last:
         if values := validate(task, average):
             run.log(step, values, phase="val")
         return values
@@ -245,11 +249,11 @@ def resume(
     task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run
 ) -> tuple[int, float]:
     """Load the run's checkpoint if there is one; return the numbers of finished steps and of seconds."""
-    found = checkpoint.read(run.checkpoint) if distributed.is_first() and run.checkpoint.exists() else None
-    found = distributed.broadcast(found)
-    if found is None:
+    state = checkpoint.read(run.checkpoint) if distributed.is_first() and run.checkpoint.exists() else None
+    state = distributed.broadcast(state)
+    if state is None:
         return 0, 0.0
-    tensors, values = found
+    tensors, values = state
     checkpoint.load_module("module", task.module, tensors)
     checkpoint.load_optimiser(optimiser, tensors)
     average.load(tensors)

@@ -165,7 +165,7 @@ class Optim:
         return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
 
     def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
-        """Make the object that provides the module's final weights."""
+        """Return the average over steps that provides the final weights; without EMA, the last weights."""
         return EMA(module, self.ema) if self.ema else Average(module)
 
 
@@ -236,7 +236,7 @@ class ScheduleFree(Optim):
         return optimiser
 
     def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
-        """Make the object that provides the final weights: the optimiser's own average."""
+        """Return the average that the optimiser maintains."""
         return ScheduleFreeAverage(module, optimiser)
 
 
@@ -350,11 +350,11 @@ class Average:
         """Write the final weights into the module."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors for a checkpoint; each name begins with "average."."""
+        """Return the average's tensors for a checkpoint; their names begin with "average."."""
         return {}
 
     def load(self, tensors: dict[str, Tensor]) -> None:
-        """Restore the average from a checkpoint's tensors, which include the result of `tensors`."""
+        """Restore the average from a checkpoint's tensors. Names without "average." are ignored."""
 
     @contextmanager
     def using_average(self) -> Iterator[None]:

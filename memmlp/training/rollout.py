@@ -21,7 +21,7 @@ from memmlp.networks.motion_model import MotionModel, State
 
 
 class TrainingCall(NamedTuple):
-    """The arguments of `MotionModel.training_call` for one training step.
+    """The arguments of `MotionModel.compute_training_outputs` for one training step.
 
     Attributes:
         sparse: world inputs (B, n, 54) of the new frames.

@@ -171,7 +171,8 @@ class MotionTask(TrainingTask):
         self.model, self.loss, self.rollout, self.dataset = model, loss, rollout, dataset
         self.module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
         self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, drawn_by, shares)
-        self.training_call = torch.compile(model.training_call) if optim.compile else model.training_call
+        compute = model.compute_training_outputs
+        self.compute_training_outputs = torch.compile(compute) if optim.compile else compute
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
@@ -182,7 +183,7 @@ class MotionTask(TrainingTask):
     def step(self, step: int) -> StepResult:
         """Compute the loss of a training step."""
         call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
-        motion, state, own = self.training_call(call.sparse, call.state, call.true_frames)
+        motion, state, own = self.compute_training_outputs(call.sparse, call.state, call.true_frames)
         self.rollout.keep(state)
         members = len(motion) // len(call.true_frames)  # a network may return the motion of several
         true = call.true_frames[:, -motion.shape[1] :].repeat(members, 1, 1)

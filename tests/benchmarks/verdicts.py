@@ -241,7 +241,7 @@ def campaign(sample: Simulated, shares: Shares) -> Campaign:
         known, mean = sample.mixed(shares, number)
         means = mean.reshape(tables, TABLE) + truth
         p, q = (
-            known.compute_level(d.ravel()).reshape(means.shape)
+            known.compute_significance_level(d.ravel()).reshape(means.shape)
             for d in (np.abs(means), MARGIN - np.abs(means))
         )
         now_same = _claimed(q, same, differ, level)

@@ -73,8 +73,8 @@ def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(
 
     found = latency.time_in_rounds("ab", 3, time_round)
     assert order == ["a", "b", "b", "a", "a", "b"]
-    assert found["a"].core_shares.tolist() == [1, 1, 1]
-    assert found["b"].core_shares.tolist() == [1, 0.25, 1]
+    assert found["a"].core_fractions.tolist() == [1, 1, 1]
+    assert found["b"].core_fractions.tolist() == [1, 0.25, 1]
     assert found["b"].seconds.tolist() == [[2], [2], [2]]
 
 

@@ -27,7 +27,7 @@ from memmlp.deploy.parity import (
 )
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.own_past_memory import NoCodesMemory
+from memmlp.networks.own_past_memory import MemoryWithoutCodes
 from memmlp.networks.streaming import streaming
 
 pytestmark = pytest.mark.slow
@@ -50,7 +50,7 @@ def test_a_file_is_checked_with_a_full_past_where_a_clip_is_long_enough():
 
 def test_a_forgotten_past_is_a_difference_that_a_short_clip_hides():
     """A memory that always recalls nothing is like one that has nothing to recall yet."""
-    model = tiny.model(NoCodesMemory, coordinates=Heading())
+    model = tiny.model(MemoryWithoutCodes, coordinates=Heading())
     broken = copy.deepcopy(model)
     broken.memory.remember = lambda motion, past, state, new: {"motion": torch.zeros_like(state["motion"])}
     (clip,) = select_parity_clips(model, [tiny.clip(200)])

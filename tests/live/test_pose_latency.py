@@ -13,4 +13,4 @@ def test_a_whole_pose_is_timed(step_files):
     assert 0 < found["pose_median_ms"] <= found["pose_p95_ms"]
     assert 0 < found["pose_core_share"] < 1.01
     (times,) = time_poses_in_rounds({"one": file}, 2, 3).values()
-    assert (times.seconds.shape, times.core_shares.shape) == ((2, 3), (2,))
+    assert (times.seconds.shape, times.core_fractions.shape) == ((2, 3), (2,))

@@ -31,7 +31,7 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
     truth = tiny.clip(7)[None].expand(64, -1, -1)
     state = model.true_state(truth[:, :-1])
     torch.manual_seed(0)
-    motion, *_ = model.training_call(truth[:, -1:, :SPARSE_DIM], state, truth)
+    motion, *_ = model.compute_training_outputs(truth[:, -1:, :SPARSE_DIM], state, truth)
     (noisy, time, encoded), *_ = seen
     frames = model.normalizer.encode(truth)
     signal = model.diffusion.signal[time][:, None, None]

@@ -25,7 +25,7 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
         denoise = model.denoise
         model.denoise = lambda *args, denoise=denoise, seen=seen: (seen.append(args), denoise(*args))[1]
         torch.manual_seed(0)
-        motion, _, losses = model.training_call(
+        motion, _, losses = model.compute_training_outputs(
             TRUTH[:, -1:, :SPARSE_DIM], model.true_state(TRUTH[:, :-1]), TRUTH
         )
         assert float(motion[..., ROTATION].detach().abs().max()) == pytest.approx(1)  # kept within limits

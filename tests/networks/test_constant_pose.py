@@ -54,7 +54,7 @@ def test_its_first_gradient_is_that_of_rotations(normalize: bool):
         else Normalizer.from_coordinates(Heading(), tiny.REST)
     )
     model = ConstantPose(made, ConstantPoseSettings(frames=7))
-    motion = model.training_call(CLIP[None, :7, :SPARSE_DIM], {}, CLIP[None, :7]).motion
+    motion = model.compute_training_outputs(CLIP[None, :7, :SPARSE_DIM], {}, CLIP[None, :7]).motion
     (rotations(motion) * torch.rand(22, 3, 3)).sum().backward()
     assert 1e-3 < float(model.pose.grad.norm()) < 1e3
 

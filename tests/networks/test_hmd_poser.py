@@ -51,12 +51,12 @@ def test_an_lstm_is_torchs_with_weights_of_direction_and_gain():
 def test_the_shape_is_trained_to_be_the_same_within_a_window():
     model = tiny.baseline("hmd_poser", shape_weight=0.5)
     truth = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
-    motion, _, losses = model.training_call(truth[..., :SPARSE_DIM], model.initial_state(2), truth)
+    motion, _, losses = model.compute_training_outputs(truth[..., :SPARSE_DIM], model.initial_state(2), truth)
     torch.testing.assert_close(motion, model.advance(truth[..., :SPARSE_DIM], model.initial_state(2))[0])
     features = model.compute_features(truth[..., :SPARSE_DIM], model.initial_state(2))[0]
     shapes = model.shape(features).detach().numpy()
     expected = 0.5 * np.abs(shapes - shapes.mean(1, keepdims=True)).mean()
     assert float(losses["shape"].detach()) == pytest.approx(expected, rel=1e-4)
     plain = tiny.baseline("hmd_poser", shape_weight=0)
-    assert plain.training_call(truth[..., :SPARSE_DIM], plain.initial_state(2), truth).losses == {}
+    assert plain.compute_training_outputs(truth[..., :SPARSE_DIM], plain.initial_state(2), truth).losses == {}
     assert model.count_parameters() - plain.count_parameters() == 8 * 16 * 16 + 16 + 16 * 16 + 16

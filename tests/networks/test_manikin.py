@@ -154,13 +154,13 @@ def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_b
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[[0.1]], [[0.7]]]).double())
     state = model.initial_state(2)
     expected = model.advance(SPARSE, state)[0]
-    motion, *_ = model.training_call(SPARSE, state, TRUTH)
+    motion, *_ = model.compute_training_outputs(SPARSE, state, TRUTH)
     torch.testing.assert_close(motion, expected[:, -motion.shape[1] :], atol=1e-6, rtol=0)
     world = tiny.baseline(name, World()).double()
     world.normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
     predicted = world.predict_parts
     world.predict_parts = lambda encoded: (seen.append(encoded), predicted(encoded))[1]
-    world.training_call(SPARSE, state, TRUTH)
+    world.compute_training_outputs(SPARSE, state, TRUTH)
     heads = [window[..., 36:39][:, -world.frames :] for window in (SPARSE, seen[0])]
     torch.testing.assert_close(heads[0][..., 2], heads[1][..., 2])
     torch.testing.assert_close(heads[0][..., :2].norm(dim=-1), heads[1][..., :2].norm(dim=-1))
@@ -168,5 +168,6 @@ def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_b
     still = tiny.baseline(name, World(), turned=False).double()
     still.normalizer = world.normalizer
     torch.testing.assert_close(
-        still.training_call(SPARSE, state, TRUTH)[0], still.advance(SPARSE, state)[0][:, -motion.shape[1] :]
+        still.compute_training_outputs(SPARSE, state, TRUTH)[0],
+        still.advance(SPARSE, state)[0][:, -motion.shape[1] :],
     )

@@ -11,7 +11,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import WindowSampler
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
-from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
+from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, MemoryWithoutCodes
 from memmlp.networks.predictor import RotationOnlyMemorySettings, TwoBranchMemorySettings
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
@@ -164,7 +164,7 @@ def test_the_vqvaes_terms_are_eq_1_in_the_worlds_units_and_the_codebooks_loss():
 @pytest.mark.parametrize(
     ("kind", "predictor"),
     [
-        (NoCodesMemory, TwoBranchMemorySettings),
+        (MemoryWithoutCodes, TwoBranchMemorySettings),
         (CodeMemory, RotationOnlyMemorySettings),
         (LSTMMemory, TwoBranchMemorySettings),
     ],

@@ -22,7 +22,7 @@ from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
+from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, MemoryWithoutCodes
 from memmlp.networks.predictor import RotationOnlySettings, TwoBranchMemorySettings, TwoBranchSettings
 from memmlp.networks.streaming import has_streaming_graph, streaming
 
@@ -35,7 +35,9 @@ def without_blocks() -> MemMLP:
 
 MEM_MLP: dict[str, Callable[[], MotionModel]] = {
     "no memory": partial(tiny.model, NoMemory),
-    "no codes": partial(tiny.model, NoCodesMemory, TwoBranchMemorySettings, fusion="plain", shift="frame"),
+    "no codes": partial(
+        tiny.model, MemoryWithoutCodes, TwoBranchMemorySettings, fusion="plain", shift="frame"
+    ),
     "codes": partial(tiny.model, CodeMemory, coordinates=World(), shift="frame"),
     "codes, window": partial(tiny.model, CodeMemory, RotationOnlySettings, coordinates=Heading()),
     "codes, plain": partial(tiny.model, CodeMemory, TwoBranchMemorySettings, fusion="plain", blend=0.2),

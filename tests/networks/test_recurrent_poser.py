@@ -25,7 +25,7 @@ def test_each_member_learns_by_itself_and_live_they_are_averaged():
     model = tiny.recurrent_poser(Heading(), members=2, output="global")
     truth = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
     sparse = truth[..., :SPARSE_DIM]
-    learned, after, _ = model.training_call(sparse, model.initial_state(2), truth)
+    learned, after, _ = model.compute_training_outputs(sparse, model.initial_state(2), truth)
     alone = tiny.recurrent_poser(Heading(), output="global")
     for index, name in enumerate(model.members):
         alone.members["member1"].load_state_dict(model.members[name].state_dict())
@@ -45,7 +45,9 @@ def test_each_member_learns_by_itself_and_live_they_are_averaged():
 def test_arms_reach_where_a_pose_is_made_and_not_where_it_is_learned():
     """So that training is that of global rotations."""
     models = [tiny.recurrent_poser(Heading(), output=output) for output in ("global", "reaching")]
-    learned = [model.training_call(SPARSE, model.initial_state(), CLIP[None])[0] for model in models]
+    learned = [
+        model.compute_training_outputs(SPARSE, model.initial_state(), CLIP[None])[0] for model in models
+    ]
     assert torch.equal(*learned)
     made = [model.advance(SPARSE, model.initial_state())[0] for model in models]
     hands = SPARSE[..., SPARSE_POSITION].unflatten(-1, (3, 3))[..., 1:, :]
@@ -76,7 +78,7 @@ def test_cells_stay_exact_where_layers_are_rounded(cell):
     block.cell.register_forward_hook(lambda of, given, made: calls.append((given, made)))
     with torch.autocast("cpu", torch.bfloat16):
         assert blocks["block1"].mlp(torch.zeros(1, 16)).dtype == torch.bfloat16
-        model.training_call(SPARSE, model.initial_state(), CLIP[None])
+        model.compute_training_outputs(SPARSE, model.initial_state(), CLIP[None])
     given, made = calls[0]
     for found, expected in zip(made, block.cell(*given), strict=True):
         assert found.dtype == torch.float32

@@ -58,7 +58,7 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_d
     for running in range(3):
         steps.clear()
         monkeypatch.setattr(torch, "randint", lambda high, size, running=running: torch.tensor(running))
-        motion, *_ = model.training_call(SPARSE, model.initial_state(2), TRUTH)
+        motion, *_ = model.compute_training_outputs(SPARSE, model.initial_state(2), TRUTH)
         assert motion.shape[:2] == (2, 4)
         assert [grad for grad, _ in steps] == [False] * running + [True]
         assert training[-running - 1 :] == [own_dropout] * running + [True]

@@ -18,7 +18,7 @@ def learned(pick: float, monkeypatch) -> tuple[vae_hmd.VAEHMD, dict[str, torch.T
         if name.endswith("share"):
             parameter.data.fill_(0.5)
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.full_like(like, pick))
-    motion, _, losses = model.training_call(TRUTH[..., :SPARSE_DIM], {}, TRUTH)
+    motion, _, losses = model.compute_training_outputs(TRUTH[..., :SPARSE_DIM], {}, TRUTH)
     motion[..., ROTATION].square().sum().backward(retain_graph=True)
     return model, losses
 

@@ -12,7 +12,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.ui.run_index import read_facts
-from memmlp.runs.evaluation_file import EvaluationsAsConfigured, write_report
+from memmlp.runs.evaluation_file import ConfiguredEvaluations, write_report
 from memmlp.runs.identity import hash_evaluation_settings
 from memmlp.runs.query import build_record
 from memmlp.runs.run import Run
@@ -41,7 +41,7 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
         return (
             run.results["stream"]["combined"],
             read.means["stream"]["combined"],
-            run.evaluations_as_configured.combined_solvers,
+            run.configured_evaluations.combined_solvers,
             keys,
         )
 
@@ -69,14 +69,14 @@ def test_a_mode_that_was_measured_by_an_earlier_recipe_says_so(tmp_path: Path, m
     }
     write_report(tmp_path / f"{hash_evaluation_settings(settings)}.json", report)
     monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "mode.stream", 1)
-    assert EvaluationsAsConfigured(tmp_path, {}).outdated == {}
+    assert ConfiguredEvaluations(tmp_path, {}).outdated == {}
     monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "mode.stream", 2)
-    assert EvaluationsAsConfigured(tmp_path, {}).outdated == {"stream": "mode.stream 1 -> 2"}
+    assert ConfiguredEvaluations(tmp_path, {}).outdated == {"stream": "mode.stream 1 -> 2"}
 
 
 def test_a_damaged_file_is_named_by_what_reads_its_numbers(tmp_path: Path):
     write_json(tmp_path / "stream.json", {"mode": "stream"})
-    found = EvaluationsAsConfigured(tmp_path, {})
+    found = ConfiguredEvaluations(tmp_path, {})
     assert found.paths == [tmp_path / "stream.json"]
     for read in (lambda: found.results, lambda: found.combined_solvers):
         with pytest.raises(InputError, match=r"stream\.json: cannot be read"):

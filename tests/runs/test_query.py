@@ -24,7 +24,7 @@ ONE = {
 
 
 def holds(text: str) -> bool:
-    return parse_query(text).test_records([ONE])[0]
+    return parse_query(text).match_records([ONE])[0]
 
 
 HOLDING = [
@@ -48,7 +48,7 @@ def test_conditions_hold_or_not():
 
 
 def test_what_a_run_does_not_have_is_neither_smaller_nor_larger():
-    assert parse_query("a<1 or a>=1").test_records([{"a": 0}, {"b": 0}]) == [True, False]
+    assert parse_query("a<1 or a>=1").match_records([{"a": 0}, {"b": 0}]) == [True, False]
 
 
 WRONG = [
@@ -80,10 +80,10 @@ def test_a_network_that_diverged_fulfils_no_comparison(own: float | str, tmp_pat
     """Files hold NaN as a word, which as a text is larger than any number."""
     one = measured(tmp_path, own)
     for text in ("<1", "<=1", ">1", ">=1", "=1", "=nan", "<nan", ">nan"):
-        assert parse_query(f"stream.MPJPE{text}").test_records([one]) == [False]
-    assert parse_query("stream.MPJPE!=1").test_records([one]) == [True]
+        assert parse_query(f"stream.MPJPE{text}").match_records([one]) == [False]
+    assert parse_query("stream.MPJPE!=1").match_records([one]) == [True]
     infinite = measured(tmp_path / "other", float("inf"))
-    assert [parse_query(f"stream.MPJPE{text}").test_records([infinite]) for text in (">1e300", "<6")] == [
+    assert [parse_query(f"stream.MPJPE{text}").match_records([infinite]) for text in (">1e300", "<6")] == [
         [True],
         [False],
     ]
@@ -104,7 +104,7 @@ def test_a_number_equals_what_is_shown_of_it():
             f"a={own!r}",
             f"a={own * 1.01!r}",
         )
-        assert [parse_query(text).test_records([{"a": own}])[0] for text in conditions] == [
+        assert [parse_query(text).match_records([{"a": own}])[0] for text in conditions] == [
             True,
             False,
             True,
@@ -119,9 +119,9 @@ def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):
     add_tags(run, ["good"])
     one = build_record(run)
     text = "memory=gru and memory.layers=[2] and stream.MPJPE=6.5 and stream.position.MPJPE=7 and tag=good"
-    assert parse_query(f"{text} and status=stopped and id={run.id} and stream.rotation.MPJPE<7").test_records(
-        [one]
-    ) == [True]
+    assert parse_query(
+        f"{text} and status=stopped and id={run.id} and stream.rotation.MPJPE<7"
+    ).match_records([one]) == [True]
 
 
 def test_times_are_those_of_the_file_that_was_asked_for(tmp_path: Path):
@@ -175,4 +175,4 @@ def test_data_have_a_digest_only_where_two_have_one_name(tmp_path: Path):
     assert label_data([synth, vqvae, mocap]) == ["synth", "synth", "mocap"]
     assert label_data([synth, mocap, other]) == ["synth", "mocap bbbbbbbb", "mocap cccccccc"]
     assert label_data([unknown]) == ["dddddddd"]
-    assert parse_query("data=synth").test_records([synth, mocap]) == [True, False]
+    assert parse_query("data=synth").match_records([synth, mocap]) == [True, False]

@@ -59,12 +59,12 @@ class Shelf:
 def test_a_fleet_replaces_the_dead_and_is_no_larger_than_the_work(tmp_path: Path):
     shelf = Shelf(Living)
     fleet = Fleet(shelf, lambda: None, 3, tmp_path)
-    fleet.maintain(2)
+    fleet.keep_workers_running(2)
     assert len(shelf.handles) == 2
-    fleet.maintain(9)
+    fleet.keep_workers_running(9)
     assert len(shelf.handles) == 3
     shelf.handles[0].cancelled = True
-    fleet.maintain(9)
+    fleet.keep_workers_running(9)
     assert len(shelf.handles) == 4
     assert shelf.batches == [2, 1, 1]  # those that start at once are started together
     fleet.cancel()
@@ -72,7 +72,7 @@ def test_a_fleet_replaces_the_dead_and_is_no_larger_than_the_work(tmp_path: Path
 
 
 def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(controller, "LOOK", 0)
+    monkeypatch.setattr(controller, "READ_INTERVAL", 0)
     task = RunTask("1" * 16, "memmlp", {})
     plan = Plan("trial", tmp_path, (), (task,))
     told: list[str] = []
@@ -86,7 +86,7 @@ def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytes
                 plan.get_run(task).folder.mkdir(parents=True)
                 plan.get_run(task).fail("the loss is nan")
 
-    controller.oversee(plan, Fleet(Shelf(Living), lambda: None, 1, tmp_path), Looks())
+    controller.complete_plan(plan, Fleet(Shelf(Living), lambda: None, 1, tmp_path), Looks())
     assert told == ["new", "new", "failed"]
 
 
@@ -94,6 +94,6 @@ def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytes
 def test_workers_that_never_live_end_the_sweep(tmp_path: Path, kind: type[Dead], line: str):
     fleet = Fleet(Shelf(kind), lambda: None, 2, tmp_path)
     for _ in range(MAX_FAILED_STARTS):
-        fleet.maintain(5)
+        fleet.keep_workers_running(5)
     with pytest.raises(InputError, match=f"end as soon as they are started: {line}; see"):
-        fleet.maintain(5)
+        fleet.keep_workers_running(5)

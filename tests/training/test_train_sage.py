@@ -138,7 +138,7 @@ def test_the_lower_half_is_given_what_the_upper_one_samples():
 def test_the_whole_is_trained_through_both_samplers():
     net = tiny.baseline("sage")
     state = net.running_state(FRAMES[:, :-1, :SPARSE_DIM])
-    motion, *_ = net.training_call(FRAMES[:, -1:, :SPARSE_DIM], state, FRAMES)
+    motion, *_ = net.compute_training_outputs(FRAMES[:, -1:, :SPARSE_DIM], state, FRAMES)
     assert motion.shape[1] == 1
     motion[..., ROTATION].sum().backward()
     assert all(part.stem.weight.grad.any() for part in (net.upper, net.lower, net.decoder))

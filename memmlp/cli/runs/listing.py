@@ -80,13 +80,13 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     found = runs if every or query else [run for run in runs if not _is_finished_part(run)]
     newest = found if every or query or sort else found[:MAX_RUNS]
     records = {run.id: read_record(run) for run in newest}
-    fits = query.test_records(list(records.values())) if query else [True] * len(records)
+    fits = query.match_records(list(records.values())) if query else [True] * len(records)
     listed = [run for run, fit in zip(newest, fits, strict=True) if fit]
     if sort:
         listed = _sort_runs(listed, records, sort)
     keys = _choose_keys(columns, records, listed)
     rows = [{**records[run.id], "age": format_age(run)} for run in listed]
-    hidden = _print_table(rows, keys, asked=columns is not None)
+    hidden = _print_table(rows, keys, keys_requested=columns is not None)
     for line in (*_describe_outdated_results(listed), *_describe_hardly_trained(listed)):
         click.echo(line)
     if hidden:
@@ -167,55 +167,59 @@ def _choose_keys(columns: str | None, records: Mapping[str, Record], listed: Seq
     return list_differing_keys([run.config for run in networks], data) if len(networks) > 1 else []
 
 
-def _print_table(records: Sequence[Record], keys: Sequence[str], asked: bool) -> list[str]:
+def _print_table(records: Sequence[Record], keys: Sequence[str], keys_requested: bool) -> list[str]:
     """Print the runs as a table, and return the keys that did not fit.
 
     Args:
         records: the record of each run, with its `age`.
         keys: the keys to show.
-        asked: whether --columns set the keys; then all of them are shown, without results.
+        keys_requested: whether --columns requested the keys. Then all keys are shown, without results.
     """
-    columns = _make_columns(records, keys, asked)
-    removable = ["age"] if asked else [*REMOVABLE_COLUMNS, *reversed(keys[:MAX_COLUMNS])]
+    columns = _make_columns(records, keys, keys_requested)
+    removable = ["age"] if keys_requested else [*REMOVABLE_COLUMNS, *reversed(keys[:MAX_COLUMNS])]
     wide = Console(width=10_000)
-    while (width := wide.measure(_make_table(columns, asked)).minimum) > make_console().width and removable:
+    limit = make_console().width
+    while (width := wide.measure(_make_table(columns, keys_requested)).minimum) > limit and removable:
         columns.pop(removable.pop(0), None)
-    shown = Console(highlight=False, markup=False, width=max(make_console().width, width))
-    shown.print(_make_table(columns, asked))
+    shown = Console(highlight=False, markup=False, width=max(limit, width))
+    shown.print(_make_table(columns, keys_requested))
     return [key for key in keys if key not in columns]
 
 
-def _make_columns(records: Sequence[Record], keys: Sequence[str], asked: bool) -> dict[str, list[str]]:
+def _make_columns(
+    records: Sequence[Record], keys: Sequence[str], keys_requested: bool
+) -> dict[str, list[str]]:
     """Return the cells of all columns by header."""
     from memmlp.runs.query import label_data
 
     columns = {"run": [one["id"] for one in records]}
     columns |= {head: [str(one.get(head) or "-") for one in records] for head in ("status", "age")}
     labels = label_data(records)
-    if not asked:
+    if not keys_requested:
         columns["name"] = [str(one.get("name") or "-") for one in records]
         if len(set(labels) - {"-"}) > 1:
             columns["data"] = labels
-    for key in keys if asked else keys[:MAX_COLUMNS]:
-        values = labels if key == "data" else [format_value(one, key, whole=asked) for one in records]
-        columns[key] = list(values)
+    for key in keys if keys_requested else keys[:MAX_COLUMNS]:
+        values = [format_value(one, key, whole=keys_requested) for one in records]
+        columns[key] = labels if key == "data" else values
     if any(one.get("tag") for one in records):
         columns["tags"] = ["\n".join(one.get("tag", ())) for one in records]
-    if not asked:
+    if not keys_requested:
         columns |= {
             head: [format_number(one, key) for one in records] for head, key in RESULT_COLUMNS.items()
         }
     return columns
 
 
-def _make_table(columns: Mapping[str, Sequence[str]], asked: bool) -> Table:
+def _make_table(columns: Mapping[str, Sequence[str]], keys_requested: bool) -> Table:
     """Make a table of columns in which only names wrap."""
     table = make_plain_table()
     table.padding, table.show_edge = (0, 0), False
     table.caption_justify, table.caption_style = "left", ""
-    table.caption = None if asked else LEGEND
+    table.caption = None if keys_requested else LEGEND
     for head in columns:
-        is_name, is_number = head == "name" and not asked, head in RESULT_COLUMNS and not asked
+        is_name = head == "name" and not keys_requested
+        is_number = head in RESULT_COLUMNS and not keys_requested
         table.add_column(
             head,
             justify="right" if is_number else "left",

@@ -44,7 +44,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
     RUN is an id, the beginning of an id, or a folder.
     """
     from memmlp.report.tables.measured_run import load_measured_run
-    from memmlp.runs.evaluation_file import name_solvers
+    from memmlp.runs.evaluation_file import add_solver_names
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import find_run, is_trained
 
@@ -52,7 +52,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
     make_console().print(_make_pair_table(_summarize_run(found)))
     if is_trained(found):
         for source, measured in load_measured_run(found.folder).split_by_source().items():
-            means = name_solvers(measured.means, found.evaluations_as_configured.combined_solvers)
+            means = add_solver_names(measured.means, found.configured_evaluations.combined_solvers)
             make_console().print(_make_pair_table(flatten(means), title=f"results on {source}"))
     if found.results:
         make_console().print(_make_pair_table(collect_measured_numbers(found), title="results"))
@@ -198,10 +198,10 @@ def format_value(record: Record, key: str, whole: bool = False) -> str:
 def collect_measured_numbers(run: Run) -> dict[str, Any]:
     """Return the numbers in a run's results by dotted key; the keys include the inverse kinematics' name."""
     from memmlp.runs.deployment_folder import replace_with_deployed_times
-    from memmlp.runs.evaluation_file import name_solvers
+    from memmlp.runs.evaluation_file import add_solver_names
     from memmlp.runs.identity import flatten
 
-    results = name_solvers(run.results, run.evaluations_as_configured.combined_solvers)
+    results = add_solver_names(run.results, run.configured_evaluations.combined_solvers)
     return {
         key: value
         for key, value in flatten(replace_with_deployed_times(results)).items()
@@ -212,7 +212,7 @@ def collect_measured_numbers(run: Run) -> dict[str, Any]:
 def list_outdated_results(run: Run) -> dict[str, str]:
     """Return the results that earlier component versions measured; an empty dict for a damaged run."""
     try:
-        outdated = run.evaluations_as_configured.outdated
+        outdated = run.configured_evaluations.outdated
     except InputError:  # `read_record` reports it
         return {}
     return {f"{mode} results": f"by an earlier version: {changes}" for mode, changes in outdated.items()}

@@ -1,7 +1,7 @@
 """The loop of `memmlp live`: it reads samples, runs the stream, and sends poses to outputs and pages.
 
-Between samples, it executes orders from the page, which adjust the stream to the user. Orders arrive in the
-server's threads. A calibration starts after a countdown, so the user can leave the keyboard.
+Between samples, it executes commands from the page, which adjust the stream to the user. Commands arrive in
+the server's threads. A calibration starts after a countdown, so the user can leave the keyboard.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PAGE_SPACE = SPACES["openxr"]  # three.js uses the same axes
 TOP = 20  # maximum of the page's colour scale, cm
 UNIT = 10_000  # quaternions are multiplied by this number and sent as integers
 COUNTDOWN = 5.0  # seconds
-LONGEST = 60.0  # maximum countdown, seconds
+MAX_COUNTDOWN = 60.0  # maximum countdown, seconds
 ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
 
 Publish = Callable[[dict[str, Any]], None]
@@ -88,7 +88,7 @@ def run_loop(
         publish: gets the messages (`make_frame_message`). For a malformed sample, it gets only the counts.
         stopped: ends the loop.
         outputs: the outputs; they get each frame before the pages.
-        fitting: executes the page's orders between samples.
+        fitting: executes the page's commands between samples.
         avatar: whether messages include the avatar's pose (`make_avatar_message`).
         report: gets a line about odd samples (`OddSamples`) and about the first malformed sample.
     """
@@ -165,8 +165,8 @@ def make_avatar_message(frame: BodyFrame) -> dict[str, Any]:
     return {"turns": turns, "hips": round(hips, 4)}
 
 
-class Order(NamedTuple):
-    """An order from the page.
+class PageCommand(NamedTuple):
+    """A command from the page.
 
     Attributes:
         action: one of ACTIONS.
@@ -177,19 +177,19 @@ class Order(NamedTuple):
     value: float | None
 
 
-def read_order(fields: object) -> Order:
-    """Parse an order {"action": ..., "value": ...}. Raises InputError for invalid fields."""
+def parse_page_command(fields: object) -> PageCommand:
+    """Parse a command {"action": ..., "value": ...}. Raises InputError for invalid fields."""
     if not isinstance(fields, dict) or fields.get("action") not in ACTIONS:
         raise InputError(f"action: must be one of {', '.join(ACTIONS)}")
     value = fields.get("value")
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if value is not None and not (number and math.isfinite(value)):
         raise InputError("value: must be a finite number")
-    return Order(fields["action"], value)
+    return PageCommand(fields["action"], value)
 
 
 class Fitting:
-    """Executes orders that adjust a stream to its user: body height, floor, and calibration in a T-pose.
+    """Executes commands that adjust a stream to its user: body height, floor, and calibration in a T-pose.
 
     Args:
         stream: the stream.
@@ -209,70 +209,70 @@ class Fitting:
     ):
         self.stream, self.space, self.path = stream, space, path
         self.publish_state, self.clock = publish_state, clock
-        self.orders: queue.SimpleQueue[Order] = queue.SimpleQueue()
-        self.waiting: Order | None = None
+        self.commands: queue.SimpleQueue[PageCommand] = queue.SimpleQueue()
+        self.waiting: PageCommand | None = None
         self.due = 0.0
         self.height: float | None = None if stream.wearer.scale == 1 else stream.wearer.height
         self._publish_state("")
 
-    def submit_order(self, fields: object) -> None:
-        """Queue an order, from any thread. Raises InputError for an invalid order."""
-        self.orders.put(read_order(fields))
+    def submit_command(self, fields: object) -> None:
+        """Queue a command, from any thread. Raises InputError for an invalid command."""
+        self.commands.put(parse_page_command(fields))
 
     def step(self, trackers: QuaternionPoses | None) -> None:
-        """Execute new orders, and the waiting order after its countdown.
+        """Execute new commands, and the waiting command after its countdown.
 
         Args:
             trackers: the current poses of the devices; None without a sample.
         """
-        while not self.orders.empty():
-            order = self.orders.get()
-            if order.action in ("calibrate", "touch_floor"):
-                seconds = COUNTDOWN if order.value is None else min(max(order.value, 0.0), LONGEST)
-                self.waiting, self.due = order, self.clock() + seconds
+        while not self.commands.empty():
+            command = self.commands.get()
+            if command.action in ("calibrate", "touch_floor"):
+                seconds = COUNTDOWN if command.value is None else min(max(command.value, 0.0), MAX_COUNTDOWN)
+                self.waiting, self.due = command, self.clock() + seconds
                 self._publish_state("")
             else:
                 self.waiting = None
-                self._carry_out(order, None)
+                self._execute(command, None)
         if self.waiting and trackers and self.clock() >= self.due:
-            order, self.waiting = self.waiting, None
-            self._carry_out(order, trackers)
+            command, self.waiting = self.waiting, None
+            self._execute(command, trackers)
 
-    def _carry_out(self, order: Order, trackers: QuaternionPoses | None) -> None:
-        """Execute an order, save the calibration, and publish the result."""
+    def _execute(self, command: PageCommand, trackers: QuaternionPoses | None) -> None:
+        """Execute a command, save the calibration, and publish the result."""
         try:
-            line = self._change(order, trackers)
-            if self.path is not None and order.action != "cancel":
+            line = self._adjust_stream(command, trackers)
+            if self.path is not None and command.action != "cancel":
                 stream = self.stream
-                made = Calibration(self.space, stream.offsets, self.height, stream.wearer.floor)
-                save_calibration(self.path, made, stream.network.body)
+                calibration = Calibration(self.space, stream.offsets, self.height, stream.wearer.floor)
+                save_calibration(self.path, calibration, stream.network.body)
         except InputError as error:
             self._publish_state(str(error), failed=True)
         else:
             self._publish_state(line)
 
-    def _change(self, order: Order, trackers: QuaternionPoses | None) -> str:
-        """Apply an order to the stream, and return a line about the result."""
-        stream, value = self.stream, order.value
-        if order.action == "calibrate" and trackers:
+    def _adjust_stream(self, command: PageCommand, trackers: QuaternionPoses | None) -> str:
+        """Change the stream, and return a line about the result."""
+        stream, value = self.stream, command.value
+        if command.action == "calibrate" and trackers:
             offsets = stream.calibrate(*trackers)
             farthest = 100 * offsets.distances.max()
             line = f"Calibrated; the devices are up to {farthest:.0f} cm from the joints."
             return f"{line} Warning: {offsets.tilt_warning}" if offsets.tilt_warning else line
-        if order.action == "height":
+        if command.action == "height":
             calibrated = stream.offsets is not None
             stream.fit(value, stream.wearer.floor)
             self.height = value
             return f"Calibrate again: {FORGOTTEN}." if calibrated and stream.offsets is None else ""
-        if order.action == "touch_floor" and trackers:
+        if command.action == "touch_floor" and trackers:
             hands = [tracker[0] for tracker in trackers[1:] if tracker is not None]
             if not hands:
                 raise InputError("floor: no hand is tracked; touch the floor with a tracked hand")
             value = round(min(float(stream.space.convert_positions_to_amass(hand)[2]) for hand in hands), 4)
-        if order.action in ("floor", "touch_floor"):
+        if command.action in ("floor", "touch_floor"):
             stream.fit(self.height, value or 0.0)
             return f"The floor is at {100 * (value or 0.0):.0f} cm."
-        if order.action == "forget":
+        if command.action == "forget":
             stream.offsets = None
             stream.reset()
             return "The calibration was removed."

@@ -1,4 +1,4 @@
-"""The server of the live page. It sends files and frames (server-sent events), and receives orders.
+"""The server of the live page. It sends files and frames (server-sent events), and receives commands.
 
 Pages may be opened and closed at any time. A slow page misses frames, but does not delay other pages.
 """
@@ -24,7 +24,7 @@ from memmlp.motion.formats.gltf import write_vrm
 
 QUEUED = 240  # maximum number of queued frames for a page; older frames are dropped
 QUIET = 2.0  # seconds without a frame before a comment keeps the connection alive
-LARGEST = 1000  # maximum number of bytes of an order
+LARGEST = 1000  # maximum number of bytes of a command
 PAGE = (
     "index.html", "style.css", "main.js", "stage.js", "history.js", "wearer.js", "avatar.js",
     "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
@@ -150,8 +150,8 @@ class LiveHandler(PageHandler):
             self.send(404, TEXT, b"not found")
 
     def do_POST(self) -> None:
-        """Receive an order from the page. The answer is empty, or an error message."""
-        take, code, line = self.server.take_order, 200, ""
+        """Receive a command from the page. The answer is empty, or an error message."""
+        take, code, line = self.server.take_command, 200, ""
         with contextlib.suppress(ConnectionError, TimeoutError):
             if not self.server.access.allows_change(self.path, self.headers, self.server.server_port):
                 code = 403
@@ -173,7 +173,7 @@ class LiveServer(PageServer):
         hub: sends the frames to the pages.
         port, host, token: see `PageServer`.
         files: the page's files by name.
-        take_order: processes an order from the page, or raises InputError; None to reject all orders.
+        take_command: processes a command from the page, or raises InputError; None to reject all commands.
     """
 
     def __init__(
@@ -183,9 +183,9 @@ class LiveServer(PageServer):
         host: str = HOST,
         token: str | None = None,
         files: Mapping[str, bytes] | None = None,
-        take_order: Callable[[object], None] | None = None,
+        take_command: Callable[[object], None] | None = None,
     ):
-        self.hub, self.files, self.take_order = hub, files or load_page_files(), take_order
+        self.hub, self.files, self.take_command = hub, files or load_page_files(), take_command
         super().__init__(LiveHandler, port, host, token)
 
     def end_events(self) -> None:

@@ -351,17 +351,17 @@ def _format_motion(clip: Clip, rest: np.ndarray) -> Iterator[str]:
         for child in _list_children(joint):
             yield from below(child)
 
-    order, before = list(below(0)), None
+    order, previous_angles = list(below(0)), None
     for piece in clip.split_into_pieces():
         rotations, root = convert_to_y_up(piece, rest)
-        angles = compute_euler_zxy(rotations, before)
-        before = angles[-1]
+        angles = compute_euler_zxy(rotations, previous_angles)
+        previous_angles = angles[-1]
         values = np.concatenate([CENTIMETRES * root, angles[:, order].reshape(len(piece), -1)], 1)
         form = " ".join([NUMBER] * values.shape[1])
         yield from (form % tuple(row) for row in values.tolist())
 
 
-def compute_euler_zxy(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+def compute_euler_zxy(rotations: np.ndarray, previous_angles: np.ndarray | None = None) -> np.ndarray:
     """Return angles (N, ..., 3), degrees, with Rz Rx Ry = rotations (N, ..., 3, 3).
 
     A rotation has two triples of angles, apart from full turns. Each frame gets the triple that is nearest to
@@ -379,9 +379,9 @@ def compute_euler_zxy(rotations: np.ndarray, before: np.ndarray | None = None) -
     x = np.arctan2(rotations[..., 2, 1], second[..., 1])
     y = np.arctan2(first[..., 2], first[..., 0])
     angles = np.stack([z, x, y], -1)
-    if before is None:
+    if previous_angles is None:
         return np.degrees(_make_continuous(angles))
-    return np.degrees(_make_continuous(np.concatenate([np.radians(before)[None], angles]))[1:])
+    return np.degrees(_make_continuous(np.concatenate([np.radians(previous_angles)[None], angles]))[1:])
 
 
 def _make_continuous(angles: np.ndarray) -> np.ndarray:

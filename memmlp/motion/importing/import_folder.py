@@ -254,10 +254,11 @@ def _describe_clip(relative: Path, result: _ConvertedFile) -> ImportedClip:
 
 
 def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, str]) -> None:
-    """Move clips and record from the staging folder to `out`. Old clips of skipped files are removed.
+    """Move the clips and the record from the staging folder to `out`; remove old clips of skipped files.
 
-    A new folder `out` appears complete. In the folder of an earlier import, the old record is removed first,
-    and the new record is written last. So a folder without a record may have clips of two imports.
+    If `out` is new, the staging folder is renamed, so `out` is complete at once. Otherwise the old record is
+    removed first, and the new record is written last. A folder without a record is therefore incomplete: it
+    may have clips of two imports.
     """
     record = {**body, **asdict(report)}
     (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

@@ -153,9 +153,13 @@ def strip_namespace(nodes: Sequence[str]) -> list[str]:
 
 
 def find_nodes(nodes: Sequence[str], names: Sequence[str]) -> dict[str, str] | None:
-    """Find the node for each name: the equal node, or else the only node with an equivalent spelling.
+    """Find the node for each name of a skeleton map.
 
-    `Left_hip`, `left_hip` and `x:LeftHip` are equivalent. The result is None if a name has no node.
+    A node with the same spelling is preferred. Otherwise exactly one node must have an equivalent spelling:
+    `Left_hip`, `left_hip` and `x:LeftHip` are equivalent.
+
+    Returns:
+        The node by name; None if a name has no node, or two names have the same node.
     """
     keys = [_normalize_name(name) for name in strip_namespace(nodes)]
     count = Counter(keys)

@@ -111,7 +111,7 @@ def _plan_cache(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
     parts, groups, duplicates = assign_parts(split, summary.clips)
     files = [*names, *summary.short, *summary.damaged_files]
     split.check_groups([name for name, part in parts.items() if part], files)
-    clips = _place_clips(summary.clips, parts, groups)
+    clips = _assign_clips_to_splits(summary.clips, parts, groups)
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"data.root={source.root}: no clip for training; check data.split")
     left_out = [n for n, part in sorted(parts.items()) if part is None and n not in duplicates]
@@ -137,18 +137,18 @@ def _plan_cache(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
     )
 
 
-def _place_clips(
+def _assign_clips_to_splits(
     clips: Sequence[ClipRecord], parts: Mapping[str, str | None], groups: Mapping[str, str]
 ) -> tuple[ClipRecord, ...]:
-    """Return the clips of all parts, with their groups and their positions in the arrays."""
+    """Return the clips of all splits, with their groups and their positions in the arrays."""
     ends = dict.fromkeys(PARTS, 0)
-    placed = []
+    assigned = []
     for clip in clips:
         part = parts[clip.name]
         if part is not None:
-            placed.append(replace(clip, split=part, group=groups[clip.name], start=ends[part]))
+            assigned.append(replace(clip, split=part, group=groups[clip.name], start=ends[part]))
             ends[part] += clip.length
-    return tuple(placed)
+    return tuple(assigned)
 
 
 def _write_cache(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:

@@ -183,7 +183,7 @@ def _draw_punches(
 
 
 def _convert_to_trunk(puppet: Puppet, side: int, target: Array) -> Array:
-    """Convert a target (3,) relative to the heading to coordinates of the rotated trunk (N, 3)."""
+    """Convert a hand target (3,) from the heading's frame to the frames of the rotated trunk (N, 3)."""
     yaw = LEFT_RIGHT[side] * (puppet.tilt[:, 1] + puppet.spine[:, 1])
     out, up, forward = target
     cosine, sine = np.cos(yaw), np.sin(yaw)

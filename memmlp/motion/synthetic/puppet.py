@@ -270,7 +270,10 @@ def _compute_root(puppet: Puppet, pelvis: Rotation) -> Array:
 
 
 def _solve_leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, Rotation]:
-    """Compute the local rotations of hip, knee, ankle and foot. The knee points between pelvis and foot."""
+    """Return the local rotations of a leg's hip, knee, ankle and foot.
+
+    The knee points in the mean direction of pelvis and foot.
+    """
     name, sign = SIDES[side]
     ankle, foot = compute_ankle(puppet.feet, side)
     frames = round(puppet.settle * puppet.fps) // 2

@@ -38,12 +38,12 @@ def make_run_finder(plan: Plan, read: ReadRun) -> FindRun:
     """Return a function that reads a planned run, or returns None if the run is not finished."""
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
-    def find(variant: Variant, seed: int) -> MeasuredRun | None:
+    def find_run(variant: Variant, seed: int) -> MeasuredRun | None:
         entry = entries.get((variant.label, seed))
         complete = entry is not None and plan.is_complete(entry)
         return read(plan.get_run(entry).folder, entry.stages) if entry and complete else None
 
-    return find
+    return find_run
 
 
 def make_state_finder(plan: Plan) -> DescribeRun:
@@ -63,11 +63,11 @@ def make_state_finder(plan: Plan) -> DescribeRun:
     return describe
 
 
-def find_finished_runs(sweep: Sweep, find: FindRun) -> dict[str, RunsBySeed]:
+def find_finished_runs(sweep: Sweep, find_run: FindRun) -> dict[str, RunsBySeed]:
     """Return the finished runs by variant label and seed."""
     return {
         variant.label: {
-            seed: run for seed in sweep.get_seeds(variant) if (run := find(variant, seed)) is not None
+            seed: run for seed in sweep.get_seeds(variant) if (run := find_run(variant, seed)) is not None
         }
         for variant in sweep.list_runnable()
     }
@@ -78,7 +78,7 @@ def make_table(
     runs: Mapping[str, RunsBySeed],
     modes: Sequence[str] = MODES,
     command: str | None = None,
-    state: DescribeRun = describe_nothing,
+    describe_run: DescribeRun = describe_nothing,
     rounds: Rounds | None = None,
 ) -> Table:
     """Make the table of a sweep.
@@ -89,20 +89,21 @@ def make_table(
         modes: the evaluation modes to show ("stream", "window"). Modes without results are left out if
             another mode has results.
         command: the command that makes missing runs; by default, `memmlp sweep` and the sweep's name.
-        state: describes the state of an unfinished run, or returns None.
+        describe_run: describes the state of an unfinished run, or returns None.
         rounds: the seed rounds that decided the verdicts; None for a fixed number of seeds.
     """
     has_errors = bool(set(sweep.metrics) - set(COSTS))
-    evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
+    evaluated = {mode for seeds in runs.values() for run in seeds.values() for mode in run.means}
     existing = tuple(mode for mode in modes if mode in evaluated) or tuple(modes)
     shown_modes = existing if has_errors else tuple(modes)[:1]
     shown = use_existing_branches(sweep, runs)
     # The correction includes both modes, even if only one is shown.
-    found = compute_effects(shown, runs, MODES if has_errors else shown_modes)
-    comparisons = sum(effect.p is not None for effect in found.values())
+    effects = compute_effects(shown, runs, MODES if has_errors else shown_modes)
+    comparisons = sum(effect.p is not None for effect in effects.values())
     if rounds:
-        found, comparisons = rounds.apply_verdicts(found), len(rounds.list_comparison_keys(sweep))
-    flags = find_flags(shown, sweep, runs, command or f"memmlp sweep {sweep.name}", state)
+        effects, comparisons = rounds.apply_verdicts(effects), len(rounds.list_comparison_keys(sweep))
+    flags = find_flags(shown, sweep, runs, command or f"memmlp sweep {sweep.name}", describe_run)
+    rows = (_make_row(shown, one, runs.get(one.label), shown_modes, effects) for one in shown.variants)
     return Table(
         name=sweep.name,
         title=sweep.title,
@@ -113,7 +114,7 @@ def make_table(
         branch_source=sweep.branch_source,
         smallest=dict(sweep.smallest),
         comparisons=comparisons,
-        rows=tuple(_make_row(shown, one, runs.get(one.label), shown_modes, found) for one in shown.variants),
+        rows=tuple(rows),
         notes=(*sweep.notes, *(f"{one.label}: {one.note}" for one in sweep.variants if one.note)),
         flags=(*flags, *(() if rounds else flag_early_tables(shown, runs))),
         analyses=tuple((one.seeds, one.level) for one in rounds.analyses) if rounds else (),
@@ -176,30 +177,30 @@ def restrict_to_source(
     parts = {
         label: {seed: run.split_by_source() for seed, run in seeds.items()} for label, seeds in runs.items()
     }
-    own: dict[str, RunsBySeed] = {
+    restricted: dict[str, RunsBySeed] = {
         label: {seed: found[source] for seed, found in seeds.items() if source in found}
         for label, seeds in parts.items()
     }
-    if not any(own.values()):
+    if not any(restricted.values()):
         names = sorted(
             {name for seeds in parts.values() for by_source in seeds.values() for name in by_source}
         )
         expected = f"must be {' or '.join(names)}" if names else "the data has a single source"
         raise InputError(f"--source {source}: no finished run has test clips from this source; {expected}")
-    without = {label for label, seeds in runs.items() if seeds and not own[label]}
+    removed = {label for label, seeds in runs.items() if seeds and not restricted[label]}
     variants = [
-        replace(one, against=None) if one.against in without else one
+        replace(one, against=None) if one.against in removed else one
         for one in sweep.variants
-        if one.label not in without
+        if one.label not in removed
     ]
-    left = {label: seeds for label, seeds in own.items() if label not in without}
+    remaining = {label: seeds for label, seeds in restricted.items() if label not in removed}
     control = sweep.control
-    if control in without:
-        control = next(label for label, seeds in left.items() if seeds)
-    quoted = ", ".join(f"'{one.label}'" for one in sweep.variants if one.label in without)
-    flags = (f"no test clip of {source}, so left out: {quoted}",) if without else ()
+    if control in removed:
+        control = next(label for label, seeds in remaining.items() if seeds)
+    quoted = ", ".join(f"'{one.label}'" for one in sweep.variants if one.label in removed)
+    flags = (f"no test clip of {source}, so left out: {quoted}",) if removed else ()
     title = f"{sweep.title} (test clips of {source} alone)"
-    return replace(sweep, variants=tuple(variants), control=control, title=title), left, flags
+    return replace(sweep, variants=tuple(variants), control=control, title=title), remaining, flags
 
 
 def restrict_and_group_clips(
@@ -209,8 +210,8 @@ def restrict_and_group_clips(
     flags: tuple[str, ...] = ()
     if source:
         sweep, runs, flags = restrict_to_source(sweep, runs, source)
-    grouped, tied = group_clips(runs, patterns)
-    return sweep, grouped, (*flags, *tied)
+    grouped, group_flags = group_clips(runs, patterns)
+    return sweep, grouped, (*flags, *group_flags)
 
 
 def group_clips(
@@ -244,17 +245,17 @@ def group_clips(
     before = count_groups(runs)
     for pattern in patterns:
         try:
-            tied = regroup([pattern])
+            merged = regroup([pattern])
         except InputError as error:
             raise InputError(f"--together {pattern}: {str(error).partition(': ')[2]}") from None
-        if count_groups(tied) == before:
+        if count_groups(merged) == before:
             raise InputError(f"--together {pattern}: must match clips in different groups; nothing to merge")
     if not patterns:
         return dict(runs), ()
-    own = regroup(patterns)
-    counts = f"{count_groups(own)} groups of test clips in place of {before}"
+    regrouped = regroup(patterns)
     quoted = ", ".join(f"'{pattern}'" for pattern in patterns)
-    return own, (f"{counts}: those whose names match {quoted} alike are together (--together)",)
+    counts = f"{before} groups of test clips into {count_groups(regrouped)}"
+    return regrouped, (f"--together merged {counts}: clips with equal matches of {quoted} form a group",)
 
 
 def write_table(table: Table, folder: Path) -> None:

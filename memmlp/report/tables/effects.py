@@ -50,7 +50,7 @@ class PairedDifferences(NamedTuple):
 
 
 def find_control(sweep: Sweep, variant: Variant) -> Variant | None:
-    """Return a variant's control; None for the sweep's control and for rows with only printed values."""
+    """Return a variant's control; None if it is the control itself, or only has the paper's values."""
     label = sweep.find_control(variant) if variant.overrides is not None else None
     return next((other for other in sweep.variants if other.label == label), None)
 

@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from memmlp.common.processes import MIN_CORE_SHARE
+from memmlp.common.processes import MIN_CORE_FRACTION
 from memmlp.report.tables.effects import RunsBySeed, have_same_errors, list_comparisons
 from memmlp.report.tables.measured_run import (
     SHARED_METRIC,
     UNKNOWN,
     MeasuredRun,
-    find_core_share,
+    find_core_fraction,
     select_undisturbed_runs,
 )
 from memmlp.report.tables.table import MAX_TIME_RATIO
@@ -48,7 +48,7 @@ def find_flags(
     requested: Sweep,
     runs: Mapping[str, RunsBySeed],
     command: str,
-    state: DescribeRun,
+    describe_run: DescribeRun,
 ) -> Iterator[str]:
     """Yield the flags of a table.
 
@@ -57,19 +57,19 @@ def find_flags(
         requested: the sweep with the branches in its file; `sweep` has existing branches instead.
         runs: the finished runs of every runnable variant, by seed.
         command: the command that makes missing runs.
-        state: describes the state of an unfinished run.
+        describe_run: describes the state of an unfinished run.
     """
     every = [
         (variant.label, run) for variant in sweep.list_runnable() for run in runs[variant.label].values()
     ]
     has_errors = bool(set(sweep.metrics) - set(COSTS))
     yield from _flag_other_data(sweep)
-    yield from _flag_missing_runs(sweep, runs, command, state)
+    yield from _flag_missing_runs(sweep, runs, command, describe_run)
     if has_errors:
         yield from _flag_branches(sweep, requested, runs, command)
     if offline := [label for label, run in every if run.origin.offline]:
         yield f"offline: uses future frames: {join_quoted(offline)}"
-    yield from _flag_same_runs(sweep, runs)
+    yield from _flag_variants_sharing_runs(sweep, runs)
     yield from _flag_unequal_clips(sweep, runs)
     yield from _flag_unequal_groups(every)
     yield from _flag_unmeasured_seeds(sweep, runs)
@@ -171,7 +171,7 @@ def join_first(texts: Sequence[str], max_count: int = 12) -> str:
     )
 
 
-def describe_core_share(label: str, share: float) -> str:
+def describe_core_fraction(label: str, share: float) -> str:
     """Describe a run whose thread had a core for only a fraction (`share`) of the timed period."""
     return f"'{label}' (had a core for {100 * share:.0f} % of the time)"
 
@@ -187,12 +187,12 @@ def _flag_other_data(sweep: Sweep) -> Iterator[str]:
 
 
 def _flag_missing_runs(
-    sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: DescribeRun
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, describe_run: DescribeRun
 ) -> Iterator[str]:
     lacking: dict[str, str] = {}
     for variant in sweep.list_runnable():
         if seeds := find_missing_seeds(sweep, variant, runs):
-            states = drop_repeats(text for seed in seeds if (text := state(variant, seed)))
+            states = drop_repeats(text for seed in seeds if (text := describe_run(variant, seed)))
             described = f" ({', '.join(states)})" if states else ""
             lacking[variant.label] = f"seed {', '.join(map(str, seeds))}{described}"
     alike = 1 < len(sweep.list_runnable()) == len(lacking) and len(set(lacking.values())) == 1
@@ -222,7 +222,7 @@ def _flag_branches(
         yield f"not evaluated in the branch {branches}: {labels}; evaluate with: {command}"
 
 
-def _flag_same_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+def _flag_variants_sharing_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     """Flag pairs of variants that are the same run under these overrides."""
     for variant, other in list_comparisons(sweep):
         ours, theirs = runs[variant.label], runs[other.label]
@@ -360,19 +360,21 @@ def _flag_unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iter
 
 
 def _flag_busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
-    found, fewer = [], []
+    busy, fewer = [], []
     for variant in sweep.list_runnable():
         label, counted = variant.label, select_undisturbed_runs(runs[variant.label])
-        shares = [share for run in counted.values() if (share := find_core_share(run)) is not None]
+        fractions = [
+            fraction for run in counted.values() if (fraction := find_core_fraction(run)) is not None
+        ]
         ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
-        if shares and min(shares) < MIN_CORE_SHARE:
-            found.append(describe_core_share(label, min(shares)))
+        if fractions and min(fractions) < MIN_CORE_FRACTION:
+            busy.append(describe_core_fraction(label, min(fractions)))
         elif ratios and max(ratios) > MAX_TIME_RATIO * min(ratios):
-            found.append(f"'{label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
+            busy.append(f"'{label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
         if len(counted) < len(runs[label]):
             fewer.append(f"'{label}' ({len(counted)} of {len(runs[label])})")
-    if found:
-        yield f"timed on a busy machine, so that other work is in the times: {join_first(found)}"
+    if busy:
+        yield f"timed on a busy machine, so that other work is in the times: {join_first(busy)}"
     if fewer:
         yield f"times are of the seeds that were timed with a core to themselves: {join_first(fewer)}"
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
-from memmlp.common.processes import MIN_CORE_SHARE
+from memmlp.common.processes import MIN_CORE_FRACTION
 from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import (
     describe_timing_machine,
@@ -30,7 +30,7 @@ from memmlp.sweep.definition import TIMES
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
 UNKNOWN = "?"
 SHARED_METRIC = "MPJPE"  # a metric of both branches
-CORE_SHARES = {
+CORE_FRACTION_KEYS = {
     "core share": "core_share",
     "network core share": "alone_core_share",
     "pose core share": "pose_core_share",
@@ -114,7 +114,7 @@ class MeasuredRun:
         groups: the group (take, subject) of each clip; an unlisted clip forms a separate group.
         costs: GFLOP and GMAC of the trained network for one frame; for the exported file, ms per step, ratio
             to the yardstick's time in the same minute, millions of parameters, MB, frames per second and
-            core shares (CORE_SHARES).
+            core shares (CORE_FRACTION_KEYS).
         origin: the code, data and machine.
         clip_sources: the source of each clip, if the data has several sources.
         run: the run's folder; None for kept results.
@@ -242,7 +242,7 @@ def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> Meas
     groups: dict[str, str] = {}
     sources: dict[str, str] = {}
     wanted = [path for name in stages or () if (path := run.evaluation(name)).is_file()]
-    paths = wanted or run.evaluations_as_configured.paths
+    paths = wanted or run.configured_evaluations.paths
     reports = keep_one_solver(list(map(_read_intact_json, paths)))
     for report in reports:
         _merge_report(means.setdefault(report["mode"], {}), report["mean"])
@@ -314,7 +314,7 @@ def _read_costs(latency: Mapping[str, Any]) -> dict[str, float]:
         "pose ms": get_cost("pose_median_ms"),
         "ratio": get_cost("ratio_to_yardstick"),
         "FPS": 1000 / get_cost("median_ms"),
-        **{name: get_cost(key) for name, key in CORE_SHARES.items()},
+        **{name: get_cost(key) for name, key in CORE_FRACTION_KEYS.items()},
     }
     return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}
 
@@ -397,9 +397,12 @@ def _merge_texts(earlier: Mapping[str, str], later: Mapping[str, str]) -> dict[s
     return {**earlier, **{name: ", ".join(each) for name, each in texts.items()}}
 
 
-def find_core_share(run: MeasuredRun) -> float | None:
-    """Return the smallest core share (CORE_SHARES) of a run; None if unknown."""
-    return min((run.costs[name] for name in CORE_SHARES if name in run.costs), default=None)
+def find_core_fraction(run: MeasuredRun) -> float | None:
+    """Return the fraction of the time in which a core ran a run's timed thread; None if unknown.
+
+    With several measurements, the smallest fraction counts.
+    """
+    return min((run.costs[name] for name in CORE_FRACTION_KEYS if name in run.costs), default=None)
 
 
 def select_undisturbed_runs(runs: Mapping[int, MeasuredRun]) -> Mapping[int, MeasuredRun]:
@@ -407,7 +410,7 @@ def select_undisturbed_runs(runs: Mapping[int, MeasuredRun]) -> Mapping[int, Mea
 
     A time does not depend on the seed, so undisturbed measurements are better than a mean over all runs.
     """
-    alone = {seed: run for seed, run in runs.items() if (find_core_share(run) or 0) >= MIN_CORE_SHARE}
+    alone = {seed: run for seed, run in runs.items() if (find_core_fraction(run) or 0) >= MIN_CORE_FRACTION}
     return alone or runs
 
 

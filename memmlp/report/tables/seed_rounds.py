@@ -49,8 +49,8 @@ ROUNDS_FILE = "rounds.json"
 
 
 @dataclass(frozen=True)
-class Finding:
-    """The finding of an interim analysis on one comparison.
+class InterimFinding:
+    """The result of an interim analysis for one comparison.
 
     Attributes:
         label, mode, metric: the key of the comparison.
@@ -90,13 +90,13 @@ class Analysis:
         seeds: the number of seeds of each analysed variant.
         level: the level that it spent.
         runs: a digest of the runs of variant and control, by label of each analysed variant.
-        findings: the findings on comparisons that were inconclusive before.
+        findings: the results for comparisons that were inconclusive before.
     """
 
     seeds: int
     level: float
     runs: Mapping[str, str]
-    findings: tuple[Finding, ...]
+    findings: tuple[InterimFinding, ...]
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,8 @@ class Rounds:
         """Count the finished analyses of a variant."""
         return sum(label in one.runs for one in self.analyses)
 
-    def find_latest(self) -> dict[Key, tuple[Finding, Analysis]]:
-        """Return the last finding on each comparison, with its analysis."""
+    def find_latest(self) -> dict[Key, tuple[InterimFinding, Analysis]]:
+        """Return the last finding for each comparison, with its analysis."""
         return {finding.key: (finding, one) for one in self.analyses for finding in one.findings}
 
     def find_next_analyses(self, sweep: Sweep) -> dict[str, int]:
@@ -201,7 +201,9 @@ class Rounds:
         """Parse the output of `asdict`. Raises KeyError, TypeError or ValueError for invalid content."""
         analyses = []
         for one in content["analyses"]:
-            findings = tuple(Finding(**{**f, "verdict": Verdict(f["verdict"])}) for f in one["findings"])
+            findings = tuple(
+                InterimFinding(**{**f, "verdict": Verdict(f["verdict"])}) for f in one["findings"]
+            )
             analyses.append(Analysis(**{**one, "findings": findings}))
         fields = {name: tuple(content[name]) for name in ("seeds", "schedule", "levels")}
         return cls(content["subject"], **fields, analyses=tuple(analyses))
@@ -350,31 +352,31 @@ def _find_pair(sweep: Sweep, label: str) -> tuple[str, str]:
 
 def _make_findings(
     rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], analysis: Analysis
-) -> list[Finding]:
+) -> list[InterimFinding]:
     seeds = rounds.seeds[: analysis.seeds]
-    cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}
+    cut = {label: {s: by_seed[s] for s in seeds if s in by_seed} for label, by_seed in runs.items()}
     pairs = pair_differences(use_existing_branches(sweep, cut), cut, MODES, analysis.runs)
-    before = {key: finding.verdict for key, (finding, _) in rounds.find_latest().items()}
-    fresh = {
+    earlier_verdicts = {key: finding.verdict for key, (finding, _) in rounds.find_latest().items()}
+    undecided_effects = {
         key: effect
         for key, effect in estimate_effects(pairs, sweep.smallest, sensitivity=False).items()
-        if before.get(key, Verdict.INCONCLUSIVE) is Verdict.INCONCLUSIVE
+        if earlier_verdicts.get(key, Verdict.INCONCLUSIVE) is Verdict.INCONCLUSIVE
     }
-    elsewhere = [
-        before.get(key, Verdict.INCONCLUSIVE)
+    other_verdicts = [
+        earlier_verdicts.get(key, Verdict.INCONCLUSIVE)
         for key in rounds.list_comparison_keys(sweep)
-        if key not in fresh and (key in before or key.label not in analysis.runs)
+        if key not in undecided_effects and (key in earlier_verdicts or key.label not in analysis.runs)
     ]
-    different, equal = _correct_p_values(list(fresh.values()), elsewhere, analysis.level)
+    different, equal = _correct_p_values(list(undecided_effects.values()), other_verdicts, analysis.level)
     variants = {variant.label: variant for variant in sweep.variants}
-    found = []
-    for (key, effect), p, q in zip(fresh.items(), different, equal, strict=True):
+    findings = []
+    for (key, effect), p, q in zip(undecided_effects.items(), different, equal, strict=True):
         paper = find_paper_effect(sweep, variants[key.label], key.metric)
         claim = decide_verdict(float(p), float(q), effect.mean, paper, analysis.level)
-        found.append(
-            Finding(*key, claim, effect.mean, effect.p, convert_nan_to_none(p), convert_nan_to_none(q))
+        findings.append(
+            InterimFinding(*key, claim, effect.mean, effect.p, convert_nan_to_none(p), convert_nan_to_none(q))
         )
-    return found
+    return findings
 
 
 def _correct_p_values(

@@ -90,10 +90,11 @@ class Error:
         a, b = seeds * a, groups * light + heavy * (b - light)
         return np.sqrt(np.maximum(np.maximum(a, b), a + b - np.minimum(seeds, groups) * e))
 
-    def compute_level(self, distance: np.ndarray) -> np.ndarray:
-        """Return the level (K,) with this half width (K,); 1 for half widths of 0 and below.
+    def compute_significance_level(self, distance: np.ndarray) -> np.ndarray:
+        """Return the error probability (K,) at which intervals have this half width (K,).
 
-        It is NaN if `distance` or a variance is not finite, because a diverged network is not evidence.
+        It is 1 for half widths of 0 and below. It is NaN if `distance` or a variance is not finite, because a
+        diverged network is not evidence.
         """
         from scipy.optimize.elementwise import find_root  # slow to import
 
@@ -203,7 +204,7 @@ def estimate_paired_effects(differences: np.ndarray, groups: Groups = None) -> E
     mean, known = differences.mean((1, 2)), estimate_error(differences, groups)
     nothing = np.full_like(mean, np.nan)
     half = nothing if known.unreplicated == "seeds and clips" else known.compute_half_width(LEVEL)
-    p = nothing if known.unreplicated else known.compute_level(np.abs(mean))
+    p = nothing if known.unreplicated else known.compute_significance_level(np.abs(mean))
     return EffectEstimates(mean, mean - half, mean + half, p, known.unreplicated)
 
 
@@ -211,7 +212,7 @@ def estimate_seed_effects(differences: np.ndarray) -> EffectEstimates:
     """Return effects from differences (K, S) of a quantity with one value per seed, such as a time."""
     alone = differences[:, :, None]
     effects, several = estimate_paired_effects(alone), differences.shape[1] > 1
-    p = estimate_error(alone).compute_level(np.abs(effects.mean)) if several else effects.p
+    p = estimate_error(alone).compute_significance_level(np.abs(effects.mean)) if several else effects.p
     return effects._replace(p=p, unreplicated="" if several else "seeds")
 
 
@@ -228,7 +229,7 @@ def compute_equivalence_p(
     known = estimate_error(differences, groups)
     if known.unreplicated:
         return np.full(len(differences), np.nan)
-    return known.compute_level(margin - np.abs(differences.mean((1, 2))))
+    return known.compute_significance_level(margin - np.abs(differences.mean((1, 2))))
 
 
 def compute_detectable(

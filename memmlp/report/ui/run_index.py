@@ -14,7 +14,7 @@ from typing import Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import make_json_safe, read_json
 from memmlp.runs.deployment_folder import select_deployed_measurements
-from memmlp.runs.evaluation_file import EvaluationsAsConfigured, name_solvers
+from memmlp.runs.evaluation_file import ConfiguredEvaluations, add_solver_names
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, find_training_settings, flatten
 from memmlp.runs.lookup import get_run_name
 from memmlp.runs.run import Run, name_latency
@@ -161,8 +161,8 @@ def _read_metrics(run: Run, config: Mapping[str, Any], damage: list[str]) -> dic
     """Return metrics and costs by dotted name, such as "stream.rotation.MPJPE"."""
     found: dict[str, Any] = {}
     try:
-        evaluations = EvaluationsAsConfigured(run.evaluations, config)
-        found |= flatten(name_solvers(evaluations.results, evaluations.combined_solvers))
+        evaluations = ConfiguredEvaluations(run.evaluations, config)
+        found |= flatten(add_solver_names(evaluations.results, evaluations.combined_solvers))
     except (InputError, KeyError, TypeError, AttributeError):
         damage.append("evaluations")
     deployed = run.find_shown_deployment(config)

@@ -15,7 +15,7 @@ from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.table_text import find_direction, find_unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, parse_line, read_config
 from memmlp.runs.deployment_folder import select_deployed_measurements
-from memmlp.runs.evaluation_file import name_solvers
+from memmlp.runs.evaluation_file import add_solver_names
 from memmlp.runs.identity import NETWORK, NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import count_training_frames, is_trained, warn_if_hardly_trained
 from memmlp.runs.run import Run
@@ -139,7 +139,7 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
     if not is_trained(run):
         return []
     try:
-        found, evaluations = load_measured_run(run.folder).clips, run.evaluations_as_configured
+        found, evaluations = load_measured_run(run.folder).clips, run.configured_evaluations
         solvers = evaluations.combined_solvers
         frames = {
             report["name"]: report.get("frames")
@@ -152,7 +152,9 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
         {
             "name": clip,
             "frames": frames.get(clip),
-            **name_solvers({mode: errors[mode] for mode in ("stream", "window") if mode in errors}, solvers),
+            **add_solver_names(
+                {mode: errors[mode] for mode in ("stream", "window") if mode in errors}, solvers
+            ),
         }
         for clip, errors in found.items()
     ]
@@ -170,7 +172,7 @@ def _read_latency(run: Run) -> dict[str, Any]:
 def list_outdated_modes(run: Run) -> list[str]:
     """Return modes with results from an earlier component version, each with the changes since."""
     try:
-        return [f"{mode} ({changes})" for mode, changes in run.evaluations_as_configured.outdated.items()]
+        return [f"{mode} ({changes})" for mode, changes in run.configured_evaluations.outdated.items()]
     except InputError:  # `damage` in the facts lists the file
         return []
 

@@ -208,7 +208,7 @@ class Sweeps:
         metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
         values: dict[tuple[str, int], float] = {}
 
-        def find(variant: Variant, seed: int) -> MeasuredRun | None:
+        def find_run(variant: Variant, seed: int) -> MeasuredRun | None:
             entry = entries.get((variant.label, seed))
             if entry is None or not plan.is_complete(entry):
                 return None
@@ -223,7 +223,7 @@ class Sweeps:
                 values[variant.label, seed] = value
             return run
 
-        runs = find_finished_runs(sweep, find)
+        runs = find_finished_runs(sweep, find_run)
         table = make_table(sweep, runs, rounds=rounds)
         table = replace(table, flags=(*table.flags, *flag, *flags))
         described = describe_rounds(rounds, sweep) if rounds else None

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, Protocol
 
 from memmlp.common.files import digest, file_digest, make_json_safe, read_json
 from memmlp.runs.deployment_folder import replace_with_deployed_times
-from memmlp.runs.evaluation_file import name_solvers
+from memmlp.runs.evaluation_file import add_solver_names
 from memmlp.runs.identity import flatten
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.metrics_log import parse_record
@@ -106,8 +106,10 @@ def read_run_facts(run: Run, running: bool = False) -> RunFacts:
     ended = _parse_time(failure.get("when") or finished) or max(
         (one.time for one in records), default=started
     )
-    evaluations, deployed = run.evaluations_as_configured, run.find_shown_deployment(config)
-    results = flatten(name_solvers(replace_with_deployed_times(run.results), evaluations.combined_solvers))
+    evaluations, deployed = run.configured_evaluations, run.find_shown_deployment(config)
+    results = flatten(
+        add_solver_names(replace_with_deployed_times(run.results), evaluations.combined_solvers)
+    )
     step = max((record.step for record in records), default=0)
     git = manifest.get("git") or {}
     origin = {name: manifest.get(name) for name in ORIGIN}

@@ -54,7 +54,7 @@ class WandB:
         return str(self.outputs.absolute() / "wandb")
 
     def fingerprint(self, run_id: str) -> str | None:
-        """Return the fingerprint in a run's offline run; None if the run has not ended there."""
+        """Return the fingerprint of the run's W&B offline run; None if the offline run has not ended."""
         files = (folder / FINGERPRINT for folder in self._folders(run_id))
         return next((file.read_text() for file in files if file.exists()), None)
 

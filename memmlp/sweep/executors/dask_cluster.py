@@ -85,14 +85,14 @@ class Dask:
             name = f"memmlp-{uuid.uuid4().hex}"
             resources = {"resources": dict(self.resources)} if self.resources else {}
             future = self.client.submit(
-                _work_in_process, work, name, self.gpus, key=name, pure=False, **resources
+                _run_in_separate_process, work, name, self.gpus, key=name, pure=False, **resources
             )
             started.append(DaskTask(future, self.distributed.Event(name, self.client)))
         return started
 
 
-def _work_in_process(work: Work, stop: str, gpus: bool) -> str | None:
-    """Do the work in a separate process, which ends with this process, or when the event `stop` is set."""
+def _run_in_separate_process(work: Work, stop: str, gpus: bool) -> str | None:
+    """Do the work in a separate process, which ends with this process or when the event `stop` is set."""
     from distributed import Event, get_worker
 
     declared = get_worker().state.total_resources.get(GPU, 0)

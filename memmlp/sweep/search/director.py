@@ -19,7 +19,7 @@ from memmlp.common.lease import check_owner
 from memmlp.runs.identity import select_inference_config
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
-from memmlp.sweep.controller import LOOK, Fleet
+from memmlp.sweep.controller import READ_INTERVAL, Fleet
 from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
 from memmlp.sweep.progress_table import count_steps
 from memmlp.sweep.search.progress_table import SearchBoard
@@ -216,8 +216,8 @@ def direct_search(director: Director, fleet: Fleet, board: SearchBoard, path: Pa
                     plan.save(path)
                 os.utime(path)
                 board.update(director.study)
-                fleet.maintain(len(plan.list_remaining()))
-                time.sleep(LOOK)
+                fleet.keep_workers_running(len(plan.list_remaining()))
+                time.sleep(READ_INTERVAL)
         replace(plan, open=False).save(path)  # a closed plan lets the workers end
     except BaseException:
         fleet.cancel()

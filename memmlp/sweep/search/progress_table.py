@@ -52,7 +52,7 @@ class SearchBoard(Screen):
 
 
 def describe_end(trial: FrozenTrial) -> str:
-    """Return a line about a trial's result, or the reason of its end, with its values."""
+    """Return a line about an ended trial: its objectives or the reason of its failure, and its parameters."""
     result = format_objectives(trial) if trial.state == TrialState.COMPLETE else get_reason(trial)
     params = ", ".join(f"{key}={_short_value(value)}" for key, value in trial.params.items())
     return f"trial {trial.number} {ENDS[trial.state]}: {result} ({params})"

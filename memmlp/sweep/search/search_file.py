@@ -188,7 +188,10 @@ def parse_search(content: Mapping[str, Any]) -> Search:
 def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
     for one in space:
         if not one.choices or one.first is not None:
-            raise InputError(f"search.space.{one.key}: must have only choices with search.sampler=grid")
+            raise InputError(
+                f"search.space.{one.key}: must have choices, without low, high and first, if "
+                "search.sampler=grid"
+            )
     combinations = math.prod(len(one.choices) for one in space)
     if n_trials != combinations:
         raise InputError(

@@ -95,12 +95,12 @@ class AvatarPoserLoss(Loss):
 
 
 def sum_joint_errors(error: Tensor) -> Tensor:
-    """Return the L1 norm of each joint's error (B, T, 22 n), averaged over frames and joints."""
+    """Return the mean over all joints of the L1 norm of a joint's error (B, T, 22 n)."""
     return error.unflatten(-1, (N_JOINTS, -1)).abs().sum(-1).mean()
 
 
 def sum_step_errors(error: Tensor) -> Tensor:
-    """Return `sum_joint_errors` of the error's frame-to-frame changes, with 0 for the last frame."""
+    """Return `sum_joint_errors` of frame-to-frame changes of the error; the last frame counts as 0."""
     frames = error.shape[1]
     return sum_joint_errors(error.diff(dim=1)) * (frames - 1) / frames
 

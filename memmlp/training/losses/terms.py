@@ -208,7 +208,7 @@ class TermsLossSettings(CompleteLossSettings):
     # learned: weights by uncertainty (Eq. 5), e^-s L + s, with one s for each term; the weights below are the
     # initial values of e^-s
     weighting: str = setting(one_of("fixed", "learned"), "fixed")
-    lr: float = setting(positive(), 1.0e-2)  # learning rate of every s with weighting=learned
+    lr: float = setting(positive(), 1.0e-2)  # learning rate of learned weights
     orientation: float | None = setting(at_least(0), None)  # the root's 6D orientation
     rotation: float | None = setting(at_least(0), 1.0)  # the other joints' local 6D rotations
     global_rotation: float | None = setting(at_least(0), None)  # all joints' global 6D rotations

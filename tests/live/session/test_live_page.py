@@ -146,7 +146,7 @@ def test_the_wearer_fits_the_stream_from_the_page(
         stream, "amass", None, hub.publish_state, clock=lambda: 0.0
     )  # a countdown ends when cancelled
     with (
-        LiveServer(hub, 0, take_order=fitting.submit_order) as server,
+        LiveServer(hub, 0, take_command=fitting.submit_command) as server,
         playing(stream, source, hub, None, fitting),
     ):
         browser.open(server.url)
@@ -164,7 +164,7 @@ def test_the_wearer_fits_the_stream_from_the_page(
         assert browser.wait("counted[0]") == "5"  # whatever it shows by now
         browser.click("#cancel")
         browser.wait("document.querySelector('#countdown').hidden")
-        fitting.submit_order({"action": "calibrate", "value": 0})
+        fitting.submit_command({"action": "calibrate", "value": 0})
         browser.wait("document.querySelector('#said').classList.contains('failed')")
         whole = "Number(document.querySelector('#latency [data-key=whole] td').textContent)"
         assert browser.wait(whole) > 0
@@ -175,7 +175,7 @@ def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: T
     """Scripts, frames and orders go by the cookie, and the token stands in the address no more."""
     asked: list[object] = []
     hub = Hub(make_greeting(Worn(clip, 60), "tiny"))
-    with LiveServer(hub, 0, "0.0.0.0", take_order=asked.append) as server:
+    with LiveServer(hub, 0, "0.0.0.0", take_command=asked.append) as server:
         address = f"http://127.0.0.1:{server.server_port}/"
         browser.call("Page.navigate", url=f"{address}?{server.url.partition('?')[2]}")
         browser.wait(f"location.href == '{address}' && document.readyState == 'complete'")

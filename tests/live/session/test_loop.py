@@ -37,7 +37,7 @@ class Wearing:
         self.states.append(state)
 
     def order(self, action: str, value: float | None = None) -> None:
-        self.fitting.submit_order({"action": action, "value": value})
+        self.fitting.submit_command({"action": action, "value": value})
 
     def pose(self, shift: float = 0.0, lower: float = 0.0):
         """Devices of a person in T-pose, 5 cm before the joints; the left hand shifted, both lowered."""

@@ -113,7 +113,7 @@ def fitted(asked: list[object]) -> Iterator[LiveServer]:
             raise InputError("no: not allowed")
         asked.append(fields)
 
-    with LiveServer(Hub({}), 0, take_order=ask) as server:
+    with LiveServer(Hub({}), 0, take_command=ask) as server:
         yield server
 
 
@@ -133,7 +133,7 @@ def test_orders_of_the_page_arrive(fitted: LiveServer, asked: list[object]):
 
 def test_at_another_address_everything_needs_the_token(clip: TrackedClip):
     token = "a token of many letters"
-    with LiveServer(Hub({}), 0, "0.0.0.0", token, take_order=pytest.fail) as server:
+    with LiveServer(Hub({}), 0, "0.0.0.0", token, take_command=pytest.fail) as server:
         for path in ("/", "/events", "/main.js", "/?token=wrong", "/events?token="):
             assert get(server, path).status == 403, path
         assert post(server, b"{}")[0] == 403

@@ -72,8 +72,8 @@ def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(t
     coarser = runs_of(sweep, fake_sweep(tmp_path / "coarser", sweep, effects, groups=wanted))
     found, flags = group_clips(own, ["^(kicks)/"])
     assert flags == (
-        "7 groups of test clips in place of 8: those whose names match '^(kicks)/' alike are together "
-        "(--together)",
+        "--together merged 8 groups of test clips into 7: clips with equal matches of '^(kicks)/' form a "
+        "group",
     )
     cells = [row.cells for row in make_table(sweep, coarser).rows]
     assert [row.cells for row in make_table(sweep, found).rows] == cells
