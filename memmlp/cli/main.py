@@ -33,7 +33,7 @@ COMMANDS = {
     "demo": Command("demo", "demo", "Run the whole pipeline on synthetic data, in minutes.", True),
     "train": Command("train", "command", "Train, evaluate, export and time one configuration (Hydra).", True),
     "data": Command("data", "data", "Make, import, prepare, inspect and export motion data."),
-    "sweep": Command("sweep", "sweep", "Run the missing runs of a table or of your is_process sweep.", True),
+    "sweep": Command("sweep", "sweep", "Run the missing runs of a table or of your own sweep.", True),
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the validation errors.", True),
     "table": Command("table", "table", "Show the paper's tables beside measured numbers."),
     "results": Command("results", "results", "Keep results of runs with the code; make pages from them."),

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.files import file_digest, now, read_json, write_json
-from memmlp.runs.environment import describe_environment
 from memmlp.runs.identity import belongs_to_folder, find_deployment_versions, hash_deployment_settings
 
 ONNX_FILES = {
@@ -68,6 +67,8 @@ class DeploymentFolder:
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write the measurements and the files' digests; this marks the deployment as complete."""
+        from memmlp.runs.environment import describe_environment  # slow to import, and the config needs ONNX_FILES
+
         files = map(self.onnx_path, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}
         write_json(
