@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from memmlp.sweep.executors.local import GpuGroup
     from memmlp.sweep.plan import Plan
 
-EXECUTORS = ("local", "slurm", "ray", "dask", "debug")  # debug runs everything in this process, for debuggers
+EXECUTORS = ("local", "slurm", "ray", "debug")  # debug runs everything in this process, for debuggers
 DEVICES_WITHOUT_GPU = {"cpu", "mps"}  # devices that do not need a CUDA GPU
-EXECUTORS_WITH_SETTINGS = ("slurm", "ray", "dask")  # executors with settings NAME.KEY=VALUE
+EXECUTORS_WITH_SETTINGS = ("slurm", "ray")  # executors with settings NAME.KEY=VALUE
 CUSTOM_PREFIX = "executor"  # prefix of the settings of a custom executor, executor.KEY=VALUE
 
 
@@ -62,12 +62,11 @@ class Workers:
             from memmlp.sweep.executors.slurm import parse_slurm_options
 
             return parse_slurm_options(self.settings)
-        if self.executor not in ("ray", "dask"):
+        if self.executor != "ray":
             return None
-        from memmlp.sweep.executors import dask_cluster, parse_settings, ray_cluster
+        from memmlp.sweep.executors import parse_settings, ray_cluster
 
-        module = ray_cluster if self.executor == "ray" else dask_cluster
-        return parse_settings(self.executor, self.settings, module.SETTINGS)
+        return parse_settings("ray", self.settings, ray_cluster.SETTINGS)
 
     def make_batch_script(self, folder: Path) -> str:
         """Return the batch file for sbatch; an empty text for executors other than Slurm."""
@@ -128,10 +127,6 @@ class Workers:
             from memmlp.sweep.executors.ray_cluster import Ray
 
             return Ray(options, gpus)
-        if self.executor == "dask":
-            from memmlp.sweep.executors.dask_cluster import Dask
-
-            return Dask(options, gpus)
         if "." in self.executor:
             from memmlp.config.plugins import import_object
 
@@ -202,7 +197,7 @@ def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple
         else:
             remaining.append(override.text)
     if executor not in EXECUTORS and "." not in executor:
-        raise InputError(f"executor={executor}: expected local, slurm, ray, dask or the path of a class")
+        raise InputError(f"executor={executor}: expected local, slurm, ray or the path of a class")
     for override in own:
         if override.group != (CUSTOM_PREFIX if "." in executor else executor):
             name = "PATH, a custom executor" if override.group == CUSTOM_PREFIX else override.group

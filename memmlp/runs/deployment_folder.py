@@ -67,7 +67,9 @@ class DeploymentFolder:
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write the measurements and the files' digests; this marks the deployment as complete."""
-        from memmlp.runs.environment import describe_environment  # slow to import, and the config needs ONNX_FILES
+        from memmlp.runs.environment import (
+            describe_environment,
+        )  # slow to import, and the config needs ONNX_FILES
 
         files = map(self.onnx_path, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}

@@ -1,4 +1,4 @@
-"""Executors start workers: processes, jobs of a Slurm cluster, or tasks of Ray or Dask.
+"""Executors start workers: processes, jobs of a Slurm cluster, or tasks of Ray.
 
 Each worker chooses its runs itself (`memmlp.sweep.worker`).
 """
