@@ -292,13 +292,13 @@ def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.mark.slow
 def test_the_reference_has_every_key_and_option(reference: ModuleType):
-    page = reference.config_page()
+    page = reference.make_config_page()
     memories = [f"memory={name}" for name in component_names("memory")]
     for word in (*memories, "model=agrol_diffusion", "model=avatar_poser", "loss=manual", "rollout=streams"):
         values = flatten(OmegaConf.to_container(compose_config([word]), resolve=False)).items()
         for key in {key for key, value in values if f"## {key}\n" not in page or value not in (None, {})}:
             assert key.rsplit(".", 1)[-1] == "name" or f"| `{key}` |" in page, f"{word}: {key}"
-    page = reference.command_page()
+    page = reference.make_command_page()
     for name in COMMANDS:
         assert f"## memmlp {name}\n" in page
     for option in ("--until-decided", "--udp PORT", "--save-predictions PATH"):
