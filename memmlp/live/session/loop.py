@@ -65,7 +65,7 @@ def make_greeting(
         "limbs": [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS],
         "heat": HEAT,
         "top": TOP,
-        "worn": source.has_wearer,
+        "wearer": source.has_wearer,
         **({"avatar": {"bones": VRM_BONES, "parents": PARENTS, "unit": UNIT}} if avatar else {}),
     }
 

@@ -26,9 +26,10 @@ QUEUED = 240  # maximum number of queued frames for a page; older frames are dro
 QUIET = 2.0  # seconds without a frame before a comment keeps the connection alive
 LARGEST = 1000  # maximum number of bytes of a command
 PAGE = (
-    "index.html", "style.css", "main.js", "stage.js", "history.js", "wearer.js", "avatar.js",
+    "index.html", "live.css", "main.js", "viewer.js", "stage.js", "wearer.js", "avatar.js",
     "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
 )  # fmt: skip
+COMMON = ("style.css", "dom.js")  # shared with memmlp's other pages
 AVATAR_SCRIPTS = {
     npm.THREE: ("build/three.module.js", "build/three.core.js", "examples/jsm/loaders/GLTFLoader.js",
                 "examples/jsm/utils/BufferGeometryUtils.js", "examples/jsm/utils/SkeletonUtils.js"),
@@ -48,6 +49,7 @@ def load_page_files(vrm: bytes | None = None) -> dict[str, bytes]:
         InputError: if an npm package cannot be downloaded.
     """
     files = {name: read_page_file("memmlp.live.session", name) for name in PAGE}
+    files |= {name: read_page_file("memmlp.common", name) for name in COMMON}
     if vrm is None:
         return files
     page = files["index.html"].replace(b"./three/three.module.min.js", b"./npm/build/three.module.js")

@@ -37,7 +37,7 @@ ABOUT = "site.json"
 SPACE = SPACES["openxr"]  # the frame of reference of all poses on the site
 OTHER_PAGES = {
     "memmlp.live.session": (
-        "stage.js", "history.js", "three/three.module.min.js", "three/three.core.min.js",
+        "viewer.js", "stage.js", "live.css", "three/three.module.min.js", "three/three.core.min.js",
         "three/OrbitControls.js", "three/LICENSE",
     ),
     "memmlp.common": ("dom.js", "style.css"),

@@ -141,7 +141,7 @@ def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: 
     hub = Hub(make_greeting(ClipSource(clip, 60), "tiny", avatar=True))
     with LiveServer(hub, 0, files=files) as server:
         browser.open(server.url)
-        browser.wait("document.documentElement.dataset.avatar == 'there'")
+        browser.wait("document.documentElement.dataset.avatar == 'loaded'")
         browser.resolved("""import('./avatar.js').then(({ Avatar }) => {
           const { pose } = Avatar.prototype;
           Avatar.prototype.pose = function (...words) {

@@ -92,10 +92,12 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
 ):
     browser.size(240, 200)  # nothing is clicked
     words = make_greeting(ClipSource(clip, 60), "tiny", remark="hardly trained" if worn else "")
-    with LiveServer(Hub(words | {"worn": worn}), 0) as server:
+    with LiveServer(Hub(words | {"wearer": worn}), 0) as server:
         browser.open(server.url)
         browser.wait(f"document.querySelector('#status').textContent == 'waiting for {what}'")
-        assert browser.value("document.querySelector('#error').hidden")  # of no frame there is no error
+        assert (
+            browser.value("document.querySelector('#mean').textContent") == "\N{EN DASH}"
+        )  # without a frame
         assert browser.value("document.querySelector('#remark').hidden") != worn
         if worn:
             said = browser.value("document.querySelector('#remark').textContent")
@@ -155,18 +157,18 @@ def test_the_wearer_fits_the_stream_from_the_page(
             change = f"i.value = {value}; i.dispatchEvent(new Event('change'))"
             browser.value(f"(i => {{ {change} }})(document.querySelector('#{name}'))")
             until(lambda name=name, value=value: getattr(stream.wearer, name) == value / 100, name)
-        browser.wait("document.querySelector('#said').textContent.includes('5 cm')")
+        browser.wait("document.querySelector('#answer').textContent.includes('5 cm')")
         noted = "new MutationObserver(() => counted.push(seconds.textContent))"
         browser.value(f"counted = []; {noted}.observe(seconds, {{ childList: true }})")
         browser.click("#calibrate")
-        browser.wait("!document.querySelector('#countdown').hidden")
+        browser.wait("document.querySelector('#countdown').open")
         assert browser.value("document.querySelector('#what').textContent") == "Stand in a T-pose"
         assert browser.wait("counted[0]") == "5"  # whatever it shows by now
         browser.click("#cancel")
-        browser.wait("document.querySelector('#countdown').hidden")
+        browser.wait("!document.querySelector('#countdown').open")
         fitting.submit_command({"action": "calibrate", "value": 0})
-        browser.wait("document.querySelector('#said').classList.contains('failed')")
-        whole = "Number(document.querySelector('#latency [data-key=whole] td').textContent)"
+        browser.wait("document.querySelector('#answer').classList.contains('failed')")
+        whole = "parseFloat(document.querySelector('#whole').textContent)"
         assert browser.wait(whole) > 0
     assert browser.errors == []
 

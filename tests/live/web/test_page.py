@@ -49,13 +49,13 @@ NOTE = """{
   };
 }"""
 """What notes that the mirror's words have told of a calibration that is none."""
-TWO = """Promise.all([import('./wear.js'), fetch('site.json')]).then(async ([{ wear }, answer]) => {
+TWO = """Promise.all([import('./vr.js'), fetch('site.json')]).then(async ([{ vr }, answer]) => {
   const site = await answer.json();
   site.networks.push({ ...site.networks[0], key: 'other', name: 'other', run: 'other', remark: '' });
   const page = document.createElement('div');
   document.querySelector('#content').replaceChildren(page);
-  delete document.documentElement.dataset.wear;
-  wear(page, site);
+  delete document.documentElement.dataset.vr;
+  vr(page, site);
 })"""
 """The wearer's page anew, with a second network to choose."""
 REMARKED = "document.querySelector('#remark').textContent"
@@ -96,8 +96,8 @@ def test_it_is_worn_and_played_without_the_server(site: Made):
         try:
             check_without_headset(server.url)
             browser.open(server.url)
-            browser.wait(f"{OPEN} == '#/wear'")
-            browser.wait(f"{SITE}.offline == 'ready' && {SITE}.wear == 'ready'")
+            browser.wait(f"{OPEN} == '#/vr'")
+            browser.wait(f"{SITE}.offline == 'ready' && {SITE}.vr == 'ready'")
             browser.wait("navigator.serviceWorker.controller !== null")
         finally:
             server.stop()
@@ -149,10 +149,10 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
 
     A calibration before, with exchanged hands and another height, is refused, and changes nothing.
     """
-    go(browser, "wear", f"{SITE}.wear == 'ready'")
+    go(browser, "vr", f"{SITE}.vr == 'ready'")
     assert browser.value(REMARKED) == f"This network is {REMARK}."
     browser.resolved(TWO)
-    browser.wait(f"{SITE}.wear == 'ready'")
+    browser.wait(f"{SITE}.vr == 'ready'")
     height = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]["height"]
     browser.value(f"document.querySelector('#height').value = {100 * height}")
     browser.resolved(TAPE)
@@ -171,7 +171,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     seen = browser.value("Number(document.querySelector('#frames').textContent)")
     later = f"Number(document.querySelector('#frames').textContent) > {seen} + 20"
     browser.resolved(f"headset.play([tPose], offsets, () => {later})")
-    assert browser.value("document.querySelector('#tall').textContent") == f"{height:.2f}"
+    assert browser.value("document.querySelector('#user-height').textContent") == f"{height:.2f}"
     browser.value(f"document.querySelector('#height').value = {100 * height}")
     browser.resolved("headset.pull()")
     browser.resolved(f"headset.play([tPose], offsets, () => {SITE}.calibrated)")

@@ -1,4 +1,4 @@
-// A VRM avatar that stands as the prediction does, at the wearer's size, by three-vrm.
+// A VRM avatar in the pose and size of the prediction, by three-vrm.
 
 import { Quaternion } from 'three';
 import { GLTFLoader } from './npm/examples/jsm/loaders/GLTFLoader.js';
@@ -13,7 +13,7 @@ export class Avatar {
     return new Avatar(vrm, description);
   }
 
-  // description: bones by joint, their parents, and the unit of quaternions.
+  // description: bones by joint, the joints' parents, and the unit of quaternions.
   constructor(vrm, description) {
     Object.assign(this, description, { vrm, scene: vrm.scene });
     this.nodes = description.bones.map(name => vrm.humanoid.getNormalizedBoneNode(name));
@@ -26,7 +26,7 @@ export class Avatar {
     this.then = performance.now();
   }
 
-  // turns: 22 quaternions xyzw as whole numbers; joints: 22 positions as 66 numbers; hips: the height of the wearer's; metres.
+  // turns: 22 quaternions xyzw as integers; joints: 66 numbers; hips: their height in the rest pose; metres.
   pose(turns, joints, hips) {
     const size = hips / this.rest;
     const side = this.mirrored ? -1 : 1;
@@ -34,11 +34,11 @@ export class Avatar {
     this.nodes.forEach((node, joint) => this.turn(node, joint, turns, side));
     this.nodes[0].position.set(side * joints[0], joints[1], side * joints[2]).divideScalar(size);
     const now = performance.now();
-    this.vrm.update(Math.min((now - this.then) / 1000, 0.1)); // hair and clothes follow, too
+    this.vrm.update(Math.min((now - this.then) / 1000, 0.1)); // also moves hair and clothes
     this.then = now;
   }
 
-  // A bone that an avatar has not hands its rotation on to those below it.
+  // The rotation of a bone that the avatar lacks is added to the bones below it.
   turn(node, joint, turns, side) {
     const [x, y, z, w] = [0, 1, 2, 3].map(i => turns[4 * joint + i] / this.unit);
     this.turned.set(side * x, y, side * z, w).normalize();

@@ -1,16 +1,17 @@
-// The scene: a floor, the truth in grey, the prediction coloured by error, a camera that goes along.
+// A scene: a floor, the truth in grey, the prediction coloured by error, a camera that follows the person.
 
 import * as THREE from 'three';
+import { h } from './dom.js';
 import { OrbitControls } from './three/OrbitControls.js';
 
-const ROUND = 20; // the number of a limb's sides
-const RINGS = 6; // the number of rings along a limb, so that its colour follows the scale
+const SIDES = 20; // of a limb
+const RINGS = 6; // along a limb, so that its colour follows the scale
 const UP = new THREE.Vector3(0, 1, 0);
-const SUN = new THREE.Vector3(1.4, 4, 1.8); // where the light stands, from the person's middle
-const START = new THREE.Vector3(1.1, 0.5, 3.2); // where the camera stands at first, from the person's middle
+const SUN = new THREE.Vector3(1.4, 4, 1.8); // from the person's middle to the light
+const START = new THREE.Vector3(1.1, 0.5, 3.2); // from the person's middle to the camera, at first
 
 export class Stage {
-  constructor(canvas, greeting) {
+  constructor(canvas, { limbs, heat, top }) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
     this.renderer.shadowMap.enabled = true;
     this.scene = new THREE.Scene();
@@ -19,13 +20,13 @@ export class Stage {
     this.controls.maxPolarAngle = 0.53 * Math.PI;
     this.controls.minDistance = 0.8;
     this.controls.maxDistance = 12;
-    this.heat = heatmap(greeting.heat, greeting.top);
-    this.prediction = new Body(greeting.limbs, 1, 1);
-    this.truth = new Body(greeting.limbs, 0.55, 0.8);
+    this.heat = heatmap(heat, top);
+    this.prediction = new Body(limbs, 1, 1);
+    this.truth = new Body(limbs, 0.55, 0.8);
     this.scene.add(this.prediction.group, this.truth.group);
     this.light();
-    this.themed();
-    matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.themed());
+    this.applyTheme();
+    matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.applyTheme());
   }
 
   light() {
@@ -41,8 +42,8 @@ export class Stage {
     this.scene.add(this.sun, this.sun.target, this.floor);
   }
 
-  // Take over the page's colours, light or dark.
-  themed() {
+  // Use the page's colours, light or dark.
+  applyTheme() {
     const style = getComputedStyle(document.documentElement);
     const colour = name => new THREE.Color(style.getPropertyValue(name).trim());
     this.scene.background = colour('--stage');
@@ -53,27 +54,27 @@ export class Stage {
     this.grey = colour('--truth');
   }
 
-  // Show a VRM avatar in place of the round limbs, as long as `dressed` is true.
-  wear(avatar) {
+  // Show a VRM avatar in place of the round limbs.
+  addAvatar(avatar) {
     this.avatar = avatar;
-    this.dressed = true;
     this.scene.add(avatar.scene);
   }
 
+  // Switch between avatar and limbs; return whether the avatar is shown.
+  toggleAvatar() { return (this.avatar.scene.visible = !this.avatar.scene.visible); }
+
   show(frame) {
     const { positions, truth, errors } = frame;
-    const known = errors !== null;
-    const dressed = Boolean(this.avatar && this.dressed);
-    if (this.avatar) this.avatar.scene.visible = dressed;
-    this.prediction.group.visible = !dressed;
-    this.truth.group.visible = known && !dressed;
-    if (dressed) this.avatar.pose(frame.turns, positions, frame.hips);
-    else this.prediction.pose(positions, known ? this.heat.bind(null, errors) : () => this.grey);
-    if (known && !dressed) this.truth.pose(truth, () => this.grey);
+    const avatar = Boolean(this.avatar?.scene.visible);
+    this.prediction.group.visible = !avatar;
+    this.truth.group.visible = errors !== null && !avatar;
+    if (avatar) this.avatar.pose(frame.turns, positions, frame.hips);
+    else this.prediction.pose(positions, errors ? this.heat.bind(null, errors) : () => this.grey);
+    if (this.truth.group.visible) this.truth.pose(truth, () => this.grey);
     this.follow(truth ?? positions, frame.restarted);
   }
 
-  // Camera and light move along with the person's middle, smoothly but for a jump.
+  // Move camera and light with the person's middle, smoothly except for a jump.
   follow(joints, jump) {
     const lowest = Math.min(...joints.filter((_, i) => i % 3 === 1));
     this.ground = Math.min(lowest, this.ground ?? lowest);
@@ -90,7 +91,7 @@ export class Stage {
     this.grid.position.set(Math.round(2 * target.x) / 2, this.ground - 0.03, Math.round(2 * target.z) / 2);
   }
 
-  // Where the camera stands, from the person's middle, to see the person from the front, a little from the side.
+  // The camera's place from the person's middle, to see the person from the front and a little from the side.
   front(joints) {
     const left = new THREE.Vector3(joints[3] - joints[6], 0, joints[5] - joints[8]); // from right to left hip
     return START.clone().applyAxisAngle(UP, Math.atan2(-left.z, left.x));
@@ -127,19 +128,21 @@ class Body {
   }
 }
 
-// A round limb: one surface of revolution, with a half circle at each end and a line between.
+// A round limb: a surface of revolution with a half sphere at each end. One morph target moves one half away from the other.
 export class Limb {
-  constructor({ start, end, radii, tip }, material, slim, round = ROUND, rings = RINGS) {
+  constructor({ start, end, radii, tip }, material, slim, sides = SIDES, rings = RINGS) {
     Object.assign(this, { start, end, tip });
-    this.profile = outline(...radii.map(radius => slim * radius), rings);
-    this.round = round;
-    this.geometry = new THREE.LatheGeometry(this.profile.map(p => new THREE.Vector2(p.x, p.y + p.part)), round);
-    const count = this.geometry.attributes.position.count;
-    this.geometry.setAttribute('color', new THREE.BufferAttribute(new Float32Array(3 * count), 3));
-    this.mesh = new THREE.Mesh(this.geometry, material);
+    const profile = outline(...radii.map(radius => slim * radius), rings);
+    this.parts = profile.map(({ part }) => part);
+    const geometry = new THREE.LatheGeometry(profile.map(({ x, y, part }) => new THREE.Vector2(x, y + part)), sides);
+    const { count } = geometry.attributes.position;
+    const shift = Array.from({ length: count }, (_, vertex) => [0, this.parts[vertex % this.parts.length], 0]);
+    geometry.morphAttributes.position = [new THREE.Float32BufferAttribute(shift.flat(), 3)];
+    geometry.morphTargetsRelative = true;
+    geometry.setAttribute('color', new THREE.Float32BufferAttribute(new Float32Array(3 * count), 3));
+    this.mesh = new THREE.Mesh(geometry, material);
     this.mesh.castShadow = slim === 1;
     this.mesh.frustumCulled = false;
-    this.length = 1;
   }
 
   pose(joints, paint) {
@@ -154,28 +157,14 @@ export class Limb {
     if (this.tip) [from, to] = [to, to.clone().addScaledVector(along, this.tip)];
     this.mesh.position.copy(from);
     this.mesh.quaternion.setFromUnitVectors(UP, along);
-    this.stretch(from.distanceTo(to));
-  }
-
-  // Make the line between the ends as long as the limb; the round ends keep their form.
-  stretch(length) {
-    if (Math.abs(length - this.length) < 1e-4) return;
-    this.length = length;
-    this.each((vertex, { y, part }) => this.geometry.attributes.position.setY(vertex, y + part * length));
-    this.geometry.attributes.position.needsUpdate = true;
+    this.mesh.morphTargetInfluences[0] = from.distanceTo(to) - 1; // the geometry is 1 m long
   }
 
   colour(paint) {
-    const colours = this.geometry.attributes.color;
-    const first = this.tip ? this.end : this.start;
-    const row = this.profile.map(({ part }) => paint(first, this.end, part));
-    this.each((vertex, _, i) => colours.setXYZ(vertex, row[i].r, row[i].g, row[i].b));
+    const colours = this.mesh.geometry.attributes.color;
+    const row = this.parts.map(part => paint(this.tip ? this.end : this.start, this.end, part));
+    for (let vertex = 0; vertex < colours.count; vertex++) colours.setXYZ(vertex, ...row[vertex % row.length]);
     colours.needsUpdate = true;
-  }
-
-  each(action) {
-    const points = this.profile.length;
-    for (let v = 0; v < (this.round + 1) * points; v++) action(v, this.profile[v % points], v % points);
   }
 }
 
@@ -198,4 +187,20 @@ function heatmap(colours, top) {
     const below = Math.min(Math.floor(place), anchors.length - 2);
     return anchors[below].clone().lerp(anchors[below + 1], place - below);
   };
+}
+
+// A frame in metres, with the joints' errors and their mean, cm, if the truth is known.
+export function measureErrors(frame) {
+  const positions = metres(frame.positions);
+  if (!frame.truth) return { ...frame, positions, truth: null, errors: null, mean: null };
+  const truth = metres(frame.truth);
+  const errors = Float32Array.from({ length: positions.length / 3 }, (_, joint) =>
+    100 * Math.hypot(...[0, 1, 2].map(i => positions[3 * joint + i] - truth[3 * joint + i])));
+  return { ...frame, positions, truth, errors, mean: errors.reduce((a, b) => a + b) / errors.length };
+}
+
+const metres = millimetres => Float32Array.from(millimetres, mm => mm / 1000);
+
+export function colourScale(heat, top) {
+  return ['0', h('i', { style: `background: linear-gradient(to right, ${heat.join(', ')})` }), `${top}+ cm`];
 }

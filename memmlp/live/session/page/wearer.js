@@ -1,68 +1,61 @@
 // Orders that fit the stream to its wearer: body height, floor, calibration in a T-pose after a countdown.
 
-const WORDS = { calibrate: 'Stand in a T-pose', touch_floor: 'Put a hand on the floor' };
+const POSES = { calibrate: 'Stand in a T-pose', touch_floor: 'Put a hand on the floor' };
 const $ = id => document.getElementById(id);
 
 export class Wearer {
   constructor() {
-    this.order('calibrate', 'calibrate');
-    this.order('touch', 'touch_floor');
-    this.order('forget', 'forget');
-    this.order('cancel', 'cancel');
-    for (const name of ['height', 'floor']) {
-      $(name).addEventListener('change', event => {
-        if (event.target.reportValidity()) ask(name, event.target.value === '' ? null : event.target.valueAsNumber / 100);
+    for (const [id, action] of [['calibrate', 'calibrate'], ['touch', 'touch_floor'], ['forget', 'forget'], ['cancel', 'cancel']]) {
+      $(id).addEventListener('click', () => {
+        this.sound ??= new AudioContext(); // a page may make a sound only after a click
+        order(action);
       });
     }
+    for (const name of ['height', 'floor']) {
+      $(name).addEventListener('change', ({ target }) => {
+        if (target.reportValidity()) order(name, target.value === '' ? null : target.valueAsNumber / 100);
+      });
+    }
+    $('countdown').addEventListener('cancel', () => order('cancel'));
     setInterval(() => this.count(), 50);
-  }
-
-  order(id, action) {
-    $(id).addEventListener('click', () => {
-      this.sound ??= new AudioContext(); // a page may make a sound only after a click
-      ask(action, null);
-    });
   }
 
   show(state) {
     for (const name of ['height', 'floor']) if (document.activeElement !== $(name)) $(name).value = state[name];
     $('forget').disabled = !state.calibrated;
-    $('said').textContent = [state.line, kept(state)].filter(Boolean).join(' ');
-    $('said').classList.toggle('failed', state.failed);
+    const storage = state.file ? `Changes are kept in ${state.file}.` : state.calibrated ? 'Not kept; --calibration FILE keeps it.' : '';
+    answer(`${state.line} ${storage}`, state.failed);
     this.waiting = state.waiting && { ...state.waiting, until: performance.now() + 1000 * state.waiting.seconds };
-    if (!this.waiting && !$('countdown').hidden) this.beep(state.failed ? 220 : 880, 0.5);
+    if (!this.waiting && $('countdown').open) this.beep(state.failed ? 220 : 880, 0.5);
     this.count();
   }
 
-  // Show the seconds that are left, and sound them for who wears a headset.
+  // Show the remaining seconds, with a sound for a wearer who does not see the page.
   count() {
-    $('countdown').hidden = !this.waiting;
-    if (!this.waiting) return;
+    if (!this.waiting) return $('countdown').close();
     const left = Math.max(Math.ceil((this.waiting.until - performance.now()) / 1000), 0);
     if (left !== this.left && left) this.beep(440, 0.12);
     this.left = left;
-    $('what').textContent = WORDS[this.waiting.action];
-    $('seconds').textContent = left || 'waiting for trackers';
+    $('what').textContent = POSES[this.waiting.action];
+    $('seconds').textContent = left || '…';
+    if (!$('countdown').open) $('countdown').showModal();
   }
 
-  beep(hertz, seconds) {
+  beep(frequency, seconds) {
     if (!this.sound) return;
-    const tone = new OscillatorNode(this.sound, { frequency: hertz });
-    const volume = new GainNode(this.sound, { gain: 0.15 });
-    tone.connect(volume).connect(this.sound.destination);
+    const tone = new OscillatorNode(this.sound, { frequency });
+    tone.connect(new GainNode(this.sound, { gain: 0.15 })).connect(this.sound.destination);
     tone.start();
     tone.stop(this.sound.currentTime + seconds);
   }
 }
 
-function kept({ file, calibrated }) {
-  if (file) return `Changes are kept in ${file}.`;
-  return calibrated ? 'Not kept; --calibration FILE keeps it.' : '';
+function answer(line, failed) {
+  $('answer').textContent = line;
+  $('answer').classList.toggle('failed', failed);
 }
 
-async function ask(action, value) {
-  const answer = await fetch('wearer', { method: 'POST', body: JSON.stringify({ action, value }) });
-  if (answer.ok) return;
-  $('said').textContent = await answer.text();
-  $('said').classList.add('failed');
+async function order(action, value = null) {
+  const response = await fetch('wearer', { method: 'POST', body: JSON.stringify({ action, value }) });
+  if (!response.ok) answer(await response.text(), true);
 }
