@@ -1,7 +1,7 @@
-"""What scripts and notebooks need for finished runs: functions to open, compare, predict, draw and stream.
+"""Functions for scripts and notebooks: open and compare finished runs, predict, draw and stream.
 
-Its names are those of the package (`memmlp.load_run`). Reading runs and results needs no torch; torch is
-imported only when a network is used.
+The package exports these names, such as `memmlp.load_run`. Runs and results are read without torch, which is
+imported when a network is used.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ def load_run(name: StrPath, outputs: StrPath | None = None, *, plugins: Sequence
 
     Args:
         name: the run's id, the beginning of its id, or its folder.
-        outputs: the folder of runs; by default that of the command line, $MEMMLP_OUTPUTS or "outputs".
-        plugins: packages with components of your own, whose code may be run. Installed packages with an entry
-            point need not be named; a run's record alone never causes an import.
+        outputs: the folder of runs; by default $MEMMLP_OUTPUTS or "outputs", like on the command line.
+        plugins: packages with custom components; their code is imported. Installed packages with an entry
+            point are used without this argument. A run's record never causes an import.
 
     Raises:
-        InputError: if there is no such run or several, if the run is not finished, or if a package can't be
+        InputError: if no run or several runs have this name, the run is not finished, or a package can't be
             imported.
     """
     _use(plugins)
@@ -63,14 +63,14 @@ def load_run(name: StrPath, outputs: StrPath | None = None, *, plugins: Sequence
 class Runs(Sequence["TrainedRun"]):
     """The finished runs of motion networks below an outputs folder, the newest first.
 
-    They are the runs that existed when this object was made. A slice is again an object of this class.
+    Runs that finish later are not included. A slice is a `Runs` object, too.
 
     Args:
-        outputs: the folder of runs; by default that of the command line, $MEMMLP_OUTPUTS or "outputs".
-        plugins: packages with components of your own, as for `load_run`.
+        outputs: the folder of runs; by default $MEMMLP_OUTPUTS or "outputs", like on the command line.
+        plugins: packages with custom components; see `load_run`.
 
     Raises:
-        InputError: if it has no folder of runs, or if a package can't be imported.
+        InputError: if `outputs` has no folder of runs, or a package can't be imported.
     """
 
     def __init__(self, outputs: StrPath | None = None, *, plugins: Sequence[str] = ()):
@@ -109,8 +109,8 @@ class Runs(Sequence["TrainedRun"]):
 class TrainedRun(os.PathLike[str]):
     """A finished run of a motion network, with its config, its results and its network.
 
-    Objects are made by `load_run` and `Runs`. Config and results need only the run's folder. `clips`, `model`
-    and `predict` also need its data; a relative path in the config is relative to the current folder, as in
+    `load_run` and `Runs` make these objects. Config and results need only the run's folder. `clips`, `model`
+    and `predict` also need the run's data. Relative paths in the config start at the current folder, like in
     training.
 
     Attributes:
@@ -173,7 +173,7 @@ class TrainedRun(os.PathLike[str]):
         its position errors are the errors of the joints from its rotations.
 
         Raises:
-            InputError: if pandas is not installed, or a file of results is damaged.
+            InputError: if pandas is not installed, or a result file is damaged.
         """
         return _frame(self._rows())
 
@@ -186,7 +186,7 @@ class TrainedRun(os.PathLike[str]):
     def model(self) -> MotionModel:
         """The trained network, a torch module in evaluation mode on the processor.
 
-        Raises InputError if it needs the code of a package that can't be imported, or that was not named.
+        Raises InputError if the network needs a package that can't be imported or is not in `plugins`.
         """
         return self._opened.network()
 
@@ -195,11 +195,11 @@ class TrainedRun(os.PathLike[str]):
 
         Args:
             clip: one of `clips`.
-            mode: "stream" for frame by frame with the network's own past, as in live use; "window" for
+            mode: "stream": frame by frame with the network's own past, like in live use; "window": in
                 non-overlapping windows.
 
         Raises:
-            InputError: for another clip or mode, or if the run's data is missing or has changed.
+            InputError: for an unknown clip or mode, or if the run's data is missing or has changed.
         """
         from memmlp.config.open_run import find_clip
         from memmlp.evaluation.predictions import predict_clip
@@ -229,9 +229,9 @@ class TrainedRun(os.PathLike[str]):
         floor: float = 0.0,
         ik: LBFGS | None = None,
     ) -> Stream:
-        """Return a live stream of the network, from its ONNX file; the arguments are those of `Stream`.
+        """Return a live stream of the run's ONNX file; see `Stream` for the arguments.
 
-        Raises InputError as `Stream` does, and if the run has no ONNX file yet.
+        Raises InputError for the reasons in `Stream`, and if the run has no ONNX file.
         """
         return Stream(
             self._run, space=space, rotations=rotations, offsets=offsets, height=height, floor=floor, ik=ik
@@ -258,8 +258,7 @@ class TrainedRun(os.PathLike[str]):
 class Prediction:
     """A network's prediction for a test clip of N frames at 60 Hz, with the truth.
 
-    Positions are metres in AMASS' world (Z up); local rotations are matrices, except for the root's, which is
-    global.
+    Positions are in metres in AMASS' world (Z up). Rotations are local matrices; the root's is global.
 
     Attributes:
         run: the run's id; clip: the clip's name; mode: "stream" or "window".
@@ -268,7 +267,7 @@ class Prediction:
             tracker.
         rotations: rotations of the rotation branch (N, 22, 3, 3).
         rest: rest joints of the body (22, 3), SMPL's body frame: Y up, the person faces +Z.
-        position_branch: joints of the position branch (N, 22, 3); None for a network without one.
+        position_branch: joints of the position branch (N, 22, 3); None for a network without this branch.
     """
 
     run: str
@@ -313,8 +312,8 @@ class Prediction:
             The file's path.
 
         Raises:
-            InputError: for another kind of file, a folder that does not exist, another branch, a piece
-                without frames, a number of poses out of range, or an MP4 without PyAV installed.
+            InputError: for an unknown suffix, a missing folder, a missing branch, a piece without frames, a
+                number of poses out of range, or an MP4 without PyAV.
         """
         from memmlp.report.pictures.clip_pictures import check_picture_path, find_frame_range, write_picture
 
@@ -330,7 +329,7 @@ class Prediction:
         """Write the rotation branch, or the truth at the same frames, as a motion file for other programs.
 
         Args:
-            path: FILE.bvh (centimetres, Y up), FILE.glb (glTF: metres, Y up, with a body to look at), or
+            path: FILE.bvh (centimetres, Y up), FILE.glb (glTF: metres, Y up, with a mannequin), or
                 FILE.npz (AMASS' layout: metres, Z up; poses, trans and mocap_framerate).
             truth: whether to write the truth instead of the prediction.
 
@@ -338,7 +337,7 @@ class Prediction:
             The file's path.
 
         Raises:
-            InputError: for another kind of file, or if the file can't be written.
+            InputError: for an unknown suffix, or if the file can't be written.
         """
         from memmlp.evaluation.predictions import make_clip
         from memmlp.motion.exporting import find_format, write_motion
@@ -367,7 +366,7 @@ def _outputs(given: StrPath | None) -> Path:
 
 
 def _use(plugins: Sequence[str]) -> None:
-    """Use the user's packages. Raises InputError for a single text, or if a package can't be imported."""
+    """Use the user's packages. Raises InputError for a text instead of a list, or if an import fails."""
     if isinstance(plugins, str):
         raise InputError(f"plugins {plugins!r}: expected a list of names, [{plugins!r}]")
     if plugins:
@@ -383,7 +382,7 @@ def _check(key: str, value: object, allowed: Iterable[object]) -> None:
 
 
 def _numbers(errors: Mapping[str, Any]) -> dict[str, float]:
-    """Return metrics as numbers; files hold NaN as a word."""
+    """Convert metrics to numbers; in files, NaN is text."""
     return {name: float(value) for name, value in errors.items()}
 
 

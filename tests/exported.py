@@ -41,9 +41,9 @@ def write(name: str, path: Path, space: str | None = None) -> None:
     # Imported here, since they take seconds to import and most test files need neither.
     from memmlp.deploy.export import export
     from memmlp.live.trackers_to_body_graph import export_full
-    from memmlp.networks.streaming import streaming
+    from memmlp.networks.streaming import make_streaming_graph
 
-    stream = streaming((NETWORKS | LARGEST)[name]())
+    stream = make_streaming_graph((NETWORKS | LARGEST)[name]())
     if space:
         export_full(stream, path, "0123456789abcdef", space)
     else:

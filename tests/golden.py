@@ -47,7 +47,7 @@ from memmlp.networks.predictor import (
     TwoBranchSettings,
 )
 from memmlp.networks.recurrent_poser import CELLS
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 from memmlp.runs.identity import find_version
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
@@ -228,7 +228,10 @@ def ik(solver: IK) -> Numbers:
     return summary("solved", solved)
 
 
-GRAPHS: dict[str, Callable] = {"graph.streaming": streaming, "graph.naive": lambda network: network}
+GRAPHS: dict[str, Callable] = {
+    "graph.streaming": make_streaming_graph,
+    "graph.naive": lambda network: network,
+}
 
 
 def deployed(graph: str) -> Numbers:
@@ -254,7 +257,7 @@ def lowered(precision: str) -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         exact, other = (Path(folder) / f"{name}.onnx" for name in ("exact", "other"))
         exact.write_bytes(exported("graph.streaming"))
-        write_lower_precision(precision, exact, other, streaming(tiny.model()), [tiny.clip(40)])
+        write_lower_precision(precision, exact, other, make_streaming_graph(tiny.model()), [tiny.clip(40)])
         return summary("motion", stream_onnx(OnnxStream(other), tiny.clip(25)))
 
 

@@ -90,7 +90,7 @@ def export_all(
     from memmlp.deploy.latency import strip_conversions
     from memmlp.deploy.lower_precision import write_lower_precision
     from memmlp.motion.body import FRAME_DIM
-    from memmlp.networks.streaming import has_streaming_graph, streaming
+    from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 
     clips = [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
     for name in progress_bar(models, "exporting"):
@@ -101,7 +101,7 @@ def export_all(
         export(strip_conversions(model), files["network"], "random")
         export(model, files["naive"], "random")
         if has_streaming_graph(model):
-            stream = streaming(model)
+            stream = make_streaming_graph(model)
             export(stream, files["streaming"], "random")
             for precision in LOWER_PRECISIONS:
                 write_lower_precision(precision, files["streaming"], files[precision], stream, clips)

@@ -44,8 +44,8 @@ def loggers() -> None:
 def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outputs: Path) -> None:
     """Update loggers with all runs.
 
-    Afterwards the loggers match the run folders, without duplicates. Runs in progress are skipped, because
-    their own processes update the loggers. You can repeat the command at any time.
+    Then the loggers show the same as the run folders, without duplicates. Runs in progress are skipped,
+    because their own processes update the loggers. You can repeat the command at any time.
     """
     from memmlp.common.progress import progress_bar
     from memmlp.runs.loggers import logger as run_loggers

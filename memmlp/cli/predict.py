@@ -59,8 +59,8 @@ def predict(
 ) -> None:
     """Write the predictions of a finished RUN (id, beginning of an id, or folder) for clips.
 
-    SOURCE is an AMASS npz file, a folder of npz files, or the name of a test clip. Predictions are at 60 Hz
-    on the body of the training. They start at the clip's second frame.
+    SOURCE is an AMASS npz file, a folder of npz files, or the name of a test clip. Predictions are at 60 Hz,
+    on the body that the network was trained with. They start at the clip's second frame.
     """
     check_runs_exist(outputs, run)
     from memmlp.cli.data.printing import show_exported
@@ -90,7 +90,7 @@ def predict(
 
 
 def choose_branch(evaluation: Evaluation, branch: str | None) -> str:
-    """Return the branch of --branch; by default, combined with inverse kinematics, otherwise rotation.
+    """Return the branch of --branch; by default combined if inverse kinematics is on, otherwise rotation.
 
     Raises:
         InputError: for --branch combined without inverse kinematics.

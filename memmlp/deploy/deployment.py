@@ -22,13 +22,13 @@ from memmlp.deploy.parity import (
     select_parity_clips,
 )
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
-from memmlp.networks.streaming import has_streaming_graph, streaming
+from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 from memmlp.runs.deployment_folder import DeploymentFolder
 
 GRAPHS: dict[str, Callable[[MotionModel], MotionModel | StreamingGraph]] = {
     "naive": lambda model: model,
-    "streaming": streaming,
-    "auto": lambda model: streaming(model) if has_streaming_graph(model) else model,
+    "streaming": make_streaming_graph,
+    "auto": lambda model: make_streaming_graph(model) if has_streaming_graph(model) else model,
 }
 """The graphs that can be exported. `naive` is the network as it was trained. `streaming` computes the
 features of each frame only once. `auto` is `streaming` if the network has a streaming graph, and `naive`

@@ -206,7 +206,7 @@ def make_yardstick() -> onnx.ModelProto:
 
 
 def _summarize_times(prefix: str, seconds: list[float]) -> dict[str, float]:
-    """Return the median and the 95th percentile in milliseconds. The prefix starts their keys."""
+    """Return the median and the 95th percentile in milliseconds; their keys begin with `prefix`."""
     return {
         f"{prefix}median_ms": 1000 * float(np.median(seconds)),
         f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
@@ -237,7 +237,7 @@ class NoConversion(Normalizer):
     def build_world_motion(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
         return self.decode_rotations(rotations, sparse)
 
-    def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
+    def compute_positions(self, motion: Tensor, sparse: Tensor) -> Tensor:
         return torch.zeros_like(motion[..., POSITION]).unflatten(-1, (N_JOINTS, 3))
 
 
@@ -247,9 +247,9 @@ def strip_conversions(model: Model) -> Model:
     Papers time a network in this way: from its features to its outputs. Joint computations between layers
     (AvatarJLM's tokens, MANIKIN's limbs) stay. The copy is only valid for timing.
     """
-    made = copy.deepcopy(model)
-    for module in list(made.modules()):
+    stripped = copy.deepcopy(model)
+    for module in list(stripped.modules()):
         for name, child in module.named_children():
             if isinstance(child, Normalizer):
                 setattr(module, name, NoConversion(child.coordinates, child.rest, child.mean, child.std))
-    return made
+    return stripped

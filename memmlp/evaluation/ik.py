@@ -41,10 +41,10 @@ class LBFGS:
     """L-BFGS on each frame separately: Table 6's "Rotation + Position Branch".
 
     The variables are an axis-angle increment per joint. It multiplies the predicted rotation from the right.
-    Unlike 6D, it does not have a redundant scale. The head stays on its tracker like in `Normalizer.pose`, so
-    the objective is the distance that the metrics measure. Rotations of leaf joints move no joint and keep
-    their predicted values. All computations use float64, so the result of a frame does not depend on the
-    other frames.
+    Unlike 6D, it does not have a redundant scale. The head stays on its tracker, like in
+    `Normalizer.compute_positions`, so the objective is the distance that the metrics measure. Rotations of
+    leaf joints move no joint and keep their predicted values. All computations use float64, so the result of
+    a frame does not depend on the other frames.
 
     torch.optim.LBFGS is not used. It has one step length and one curvature for a whole batch, so the result
     of a frame would depend on the other frames.
@@ -113,7 +113,7 @@ LEVER = 0.1  # m^2; limits the units of joints that move other joints little
 class JointDistance:
     """The objective: the sum of squared distances (m^2) between joints and targets.
 
-    Both are relative to the head.
+    Joints and targets are relative to the head.
 
     Args:
         start: local rotations (N, 22, 3, 3).

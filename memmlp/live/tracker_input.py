@@ -29,7 +29,7 @@ TrackerPose = tuple[ArrayLike, ArrayLike] | None
 
 
 class SampleWarning(UserWarning):
-    """Samples of a stream are probably not in metres, seconds or quaternions xyzw."""
+    """A warning about samples that are probably not in metres, seconds or quaternions xyzw."""
 
 
 def read_trackers(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray, Lost]:

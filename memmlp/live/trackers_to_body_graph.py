@@ -202,8 +202,8 @@ def measure_full_differences(model: MotionModel, path: Path, clip: Tensor, space
     """Return each frame's largest difference (N,) between torch and an ONNX file over a clip (N, 252).
 
     torch and the file each use their own history. torch computes the same as evaluation: features, network
-    and `Normalizer.pose`. Quaternions are converted to matrices first. If a quaternion does not have length
-    1, all differences are infinity.
+    and `Normalizer.compute_positions`. Quaternions are converted to matrices first. If a quaternion does not
+    have length 1, all differences are infinity.
     """
     positions, rotations = extract_trackers(clip[:, :SPARSE_DIM].cpu())
     sparse, reference, stream = (

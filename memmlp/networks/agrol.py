@@ -134,10 +134,10 @@ class AGRoLDiffusionGraph(StemGraph):
         """Sample by DDIM; the denoiser's last call computes only the newest frame (1, 132)."""
         diffusion, noisy = self.model.diffusion, self.model.noise
         for index in range(len(diffusion.times) - 1):
-            noisy = diffusion.step(noisy, self._denoised(noisy, window, index, self.frames), index)
-        return self._denoised(noisy, window, len(diffusion.times) - 1, 1)
+            noisy = diffusion.step(noisy, self._denoise_newest(noisy, window, index, self.frames), index)
+        return self._denoise_newest(noisy, window, len(diffusion.times) - 1, 1)
 
-    def _denoised(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Tensor:
+    def _denoise_newest(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Tensor:
         """Predict the newest `count` clean rotations at sampling step `index` from noisy ones (T, 132)."""
         h = window + F.linear(noisy, self.model.stem.weight[:, : ROTATION.stop])
         *earlier, last = zip(self.blocks, self.shifts[index], strict=True)

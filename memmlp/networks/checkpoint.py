@@ -16,7 +16,7 @@ from memmlp.common.files import atomic_write
 
 
 def write(path: Path, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
-    """Write tensors and JSON values; if killed, the old or the new file remains complete."""
+    """Write tensors and JSON values atomically."""
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     atomic_write(path, save(flat, {"memmlp": json.dumps(values)}))
 

@@ -15,7 +15,7 @@ Denoise = Callable[[Tensor, Tensor], Tensor]
 
 
 def make_cosine_schedule(steps: int) -> Tensor:
-    """Return the cosine schedule: the signal's fraction (steps,) of the noisy signal's variance, float64.
+    """Return the cosine schedule (steps,), float64; see `signal` in NoiseProcess.
 
     This is Eq. 17 of Nichol & Dhariwal 2021. The noise of one step has a variance fraction of at most 0.999.
     """
@@ -27,7 +27,7 @@ def make_cosine_schedule(steps: int) -> Tensor:
 
 
 def make_linear_schedule(steps: int) -> Tensor:
-    """Return the linear schedule: the signal's fraction (steps,) of the noisy signal's variance, float64.
+    """Return the linear schedule (steps,), float64; see `signal` in NoiseProcess.
 
     The variance fraction of one step's noise grows linearly from 1e-4 to 0.02 over 1000 steps (Ho et al.
     2020, Sec. 4). With fewer steps each step adds proportionally more noise, at most 0.999.
@@ -40,7 +40,8 @@ class NoiseProcess(nn.Module):
     """The noise process: adds noise to training signals, and defines the sampling times.
 
     Args:
-        signal: the signal's fraction (steps,) of the noisy signal's variance.
+        signal: at each diffusion time, the fraction (steps,) of a noisy signal's variance that is due to
+            the clean signal.
         sampling_steps: number of denoiser calls for a sample. Their times are evenly spaced and start at the
             schedule's last step, pure noise (Song et al. 2021, App. D.2: linear).
     """
@@ -86,7 +87,7 @@ class Diffusion(NoiseProcess):
         super().__init__(make_cosine_schedule(steps), sampling_steps)
 
     def sample(self, denoise: Denoise, noise: Tensor) -> Tensor:
-        """Sample the clean signal (B, ...) by DDIM that adds no noise (Song et al. 2021, Eq. 12, eta = 0).
+        """Sample the clean signal (B, ...) by deterministic DDIM (Song et al. 2021, Eq. 12, eta = 0).
 
         Args:
             denoise: maps a noisy signal (B, ...) and times (B,) to an estimate of the clean signal.

@@ -110,17 +110,17 @@ class Dropout(nn.Dropout):
 def find_batch_dependent_layers(module: nn.Module) -> list[str]:
     """Return the class names of layers whose result for a row depends on other rows of the batch."""
 
-    def draws(layer: nn.Module) -> bool:
+    def is_random(layer: nn.Module) -> bool:
         if isinstance(layer, nn.RNNBase):
             return layer.dropout > 0
         return isinstance(layer, _DropoutNd) and layer.p > 0 and not isinstance(layer, Dropout)
 
-    found = (
+    layers = (
         layer
         for layer in module.modules()
-        if isinstance(layer, _BatchNorm) or getattr(layer, "needs_whole_batch", False) or draws(layer)
+        if isinstance(layer, _BatchNorm) or getattr(layer, "needs_whole_batch", False) or is_random(layer)
     )
-    return sorted({type(layer).__name__ for layer in found})
+    return sorted({type(layer).__name__ for layer in layers})
 
 
 def compute_gate_products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:

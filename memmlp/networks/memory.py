@@ -105,7 +105,7 @@ class Recall(nn.Module):
         raise NotImplementedError
 
     def compute_features_before_start(self, first: Tensor) -> Tensor:
-        """Return features of frames before the first frame, from its features (1, blocks, k)."""
+        """Return features for the time before the first frame, given its features (1, blocks, k)."""
         return first
 
     def _compute_contributions(self, z: Tensor) -> Sequence[Tensor]:
@@ -169,7 +169,7 @@ class Memory(nn.Module):
         Args:
             sparse: inputs (B, past + new, 54) in network space.
             state: the state from the last call, or `initial_state`.
-            new: number of new frames, the last of the inputs.
+            new: number of new frames; they are the last frames of `sparse`.
         """
         return None
 
@@ -180,7 +180,7 @@ class Memory(nn.Module):
             motion: output (B, n, 198), n at least `count_needed(new)`.
             past: the result of `recall`.
             state: the state before the new frames.
-            new: number of new frames, the last of the output.
+            new: number of new frames; they are the last frames of `motion`.
         """
         return {}
 
@@ -284,7 +284,7 @@ class RecurrentRecall(Recall):
     """Recall for recurrent memories; features before the first frame are zeros."""
 
     def merge_features(self, features: Sequence[Any]) -> None:
-        """Note the index of each block's recurrent layer, and replace GRUs by plain layers."""
+        """Store the index of each block's recurrent layer, and replace GRUs by plain layers."""
         self.layers = [feature.index for feature in features]
         assert isinstance(self.memory, RecurrentMemory)
         for recurrence in self.memory.recurrences:
@@ -304,8 +304,8 @@ class RecurrentMemory(FeatureMemory):
     """A recurrent layer for each memory block, instead of the paper's memory (Table 15).
 
     A layer runs once over each frame. Its states and its outputs for the window's older frames are carried,
-    so a stream gives the same result for any step size. A training call sees a whole window. With teacher
-    forcing the hidden state is a projection of the last input before the window, and the cell is zero
+    so a stream gives the same result for any step size. A training step processes a whole window. With
+    teacher forcing the hidden state is a projection of the last input before the window, and the cell is zero
     (`true_state`). Otherwise, and in evaluation, the states are carried from call to call, initially zeros.
     See docs/readings.md, no. 19.
 
@@ -347,8 +347,8 @@ class RecurrentMemory(FeatureMemory):
         """
         features, states = [], []
         for index, recurrence in enumerate(self.recurrences):
-            made, after = recurrence(sparse[:, -new:], [state[name][:, index] for name in self.carried])
-            features.append(made)
+            outputs, after = recurrence(sparse[:, -new:], [state[name][:, index] for name in self.carried])
+            features.append(outputs)
             states.append(after)
         window = torch.cat([state["features"], torch.stack(features, 1)], 2)[:, :, -self.frames :]
         after = (torch.stack(of, 1) for of in zip(*states, strict=True))

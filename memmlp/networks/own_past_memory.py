@@ -1,4 +1,4 @@
-"""Memories of the network's own past, with code-vectors (Sec. 3.2.1) and without (Table 11)."""
+"""Memories of the network's own earlier motion, with code-vectors (Sec. 3.2.1) and without (Table 11)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Blend(nn.Module):
 
     Args:
         value: m at inference, in [0, 1], or "sampled" to draw it also at inference. An exported ONNX file
-            uses their mean, 0.5.
+            uses the mean of the draws, 0.5.
     """
 
     MEAN = 0.5
@@ -140,7 +140,7 @@ class CodeIndices(nn.Module):
 
 
 class OwnPastRecall(Recall):
-    """Recall for memories of the network's own past; it computes all blocks' projections together."""
+    """Recall for memories of the network's own motion; it computes all blocks' projections together."""
 
     def merge_features(self, features: Sequence[PastFeature]) -> None:
         """Make one feature module with the projections of all blocks; code-vectors use a table."""

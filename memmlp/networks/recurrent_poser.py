@@ -219,7 +219,7 @@ class EnsembleMember(nn.Module):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Map encoded inputs (B, n, 54) or (B, 54) to rotations (..., 132) and the new state.
 
-        The state of each block's cell (B, carried x d) has the block's name.
+        The names of the states, each (B, carried x d), are the blocks' names.
         """
         h, kept = self.stem(x), {}
         for name, block in self.blocks.items():
@@ -335,17 +335,17 @@ class RecurrentPoser(WindowlessModel):
         """Return the initial state: zeros (B, size) for each cell, by names of member and block."""
         return {name: self.normalizer.mean.new_zeros(batch, size) for name, size in self.sizes.items()}
 
-    def pose(self, made: Tensor, sparse: Tensor, reach: bool = True) -> Tensor:
+    def pose(self, outputs: Tensor, sparse: Tensor, reach: bool = True) -> Tensor:
         """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54).
 
         With `model.output=reaching` the arms reach to the hands' trackers if `reach` is set. Global rotations
         do not inherit errors from a joint's ancestors. Positions are sums of rotated bones.
         """
         if self.output == "local":
-            return self.normalizer.decode_rotations(made, sparse)
-        with use_float32(made.device):
+            return self.normalizer.decode_rotations(outputs, sparse)
+        with use_float32(outputs.device):
             rotations = self.normalizer.convert_rotations_to_world(
-                made.to(sparse.dtype), self.normalizer.find_origin(sparse)
+                outputs.to(sparse.dtype), self.normalizer.find_origin(sparse)
             )
             if not (reach and self.output == "reaching"):
                 return self.normalizer.build_world_motion(rotations, sparse)

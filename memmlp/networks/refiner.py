@@ -17,7 +17,7 @@ from memmlp.common.settings import Settings, at_least, one_of, positive, setting
 from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.motion_model import MotionModel, State, StreamingGraph
-from memmlp.networks.streaming import FrameGRU, has_streaming_graph, streaming
+from memmlp.networks.streaming import FrameGRU, has_streaming_graph, make_streaming_graph
 
 HIDDEN = "refiner"  # the name of the refiner's own state
 
@@ -59,7 +59,7 @@ class RefinedGraph(StreamingGraph):
     def build(self, model: Any) -> None:
         """Make the network's streaming graph and keep a copy of the refiner."""
         self.model, self.hidden = model, model.initial_state(1)[HIDDEN]
-        self.graph = streaming(model.network)
+        self.graph = make_streaming_graph(model.network)
         model.add_module("layers", FrameGRU(model.layers))  # of another class than the network's
         inner = (f"graph.{name}" for name in self.graph.float32_modules)
         self.float32_modules = (*inner, "model.layers", "model.head")

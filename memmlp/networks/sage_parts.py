@@ -199,7 +199,7 @@ class ProductQuantiser(nn.Module):
 
 
 def compute_contrast(distance: Tensor) -> Tensor:
-    """Return a codebook's contrastive loss, with each code's nearest latents against the farther half.
+    """Return a codebook's contrastive loss: nearest latents of each code-vector against the farther half.
 
     Args:
         distance: squared distances (N, 64) between latents and code-vectors.

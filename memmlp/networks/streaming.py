@@ -20,7 +20,7 @@ from memmlp.networks.layers import step_gru
 from memmlp.networks.motion_model import MotionModel, State, StreamingGraph, fill_past
 
 
-def streaming(model: MotionModel) -> StreamingGraph:
+def make_streaming_graph(model: MotionModel) -> StreamingGraph:
     """Make the streaming graph of a trained network, without changing the network.
 
     Raises:

@@ -19,7 +19,7 @@ from memmlp.config.compose import compose_config
 from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import stream_onnx
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.lookup import list_runs
 
@@ -32,7 +32,9 @@ CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     """The first tiny network's stream in float32 and in int8."""
     exact, quantised = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "int8.onnx"
-    write_lower_precision("int8", exact, quantised, streaming(exported.NETWORKS["mem_mlp"]()), CLIPS)
+    write_lower_precision(
+        "int8", exact, quantised, make_streaming_graph(exported.NETWORKS["mem_mlp"]()), CLIPS
+    )
     return exact, quantised
 
 
@@ -52,7 +54,7 @@ def weights(graph: onnx.ModelProto) -> dict[str, int]:
 
 @pytest.mark.parametrize("network", ["mem_mlp", "avatar_jlm", "manikin_s"])
 def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, network):
-    quantised, stream = tmp_path / "int8.onnx", streaming(exported.NETWORKS[network]())
+    quantised, stream = tmp_path / "int8.onnx", make_streaming_graph(exported.NETWORKS[network]())
     write_lower_precision("int8", step_files(network), quantised, stream, [CLIPS[0][:20]])
     kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]

@@ -10,7 +10,7 @@ from torch import nn
 from memmlp.common import processes
 from memmlp.deploy import latency
 from memmlp.deploy.latency import count_macs, strip_conversions
-from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
+from memmlp.motion.body import MOTION_DIM, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import NoMemory
@@ -40,6 +40,7 @@ def test_without_conversions_it_is_the_same_network(name):
         whole, ours = model.advance(clip[:, t : t + 1], ours, 1)
         bare, theirs = alone.advance(clip[:, t : t + 1], theirs, 1)
         torch.testing.assert_close(bare[..., ROTATION], whole[..., ROTATION], atol=1e-5, rtol=1e-5)
+        assert "position" in model.branches or not bare[..., POSITION].any(), "kinematics are not timed"
     assert count_macs(alone) <= count_macs(model)
 
 

@@ -29,7 +29,7 @@ from memmlp.deploy.opsets import GraphConstants
 from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +40,7 @@ CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 @pytest.mark.parametrize("network", ["mem_mlp", "refined", "avatar_poser", "sage"])
 def test_every_layer_between_the_ends_is_an_inner_one(step_files, network: str):
     """By the weights' values, whatever the exporter calls them, and whether it transposes them or not."""
-    stream, graph = streaming(exported.NETWORKS[network]()), onnx.load(step_files(network))
+    stream, graph = make_streaming_graph(exported.NETWORKS[network]()), onnx.load(step_files(network))
     weights = {
         name: weight.detach().numpy()
         for name, weight in stream.named_parameters()
@@ -68,7 +68,7 @@ def _is_of(constant: np.ndarray, weights: Iterable[np.ndarray]) -> bool:
 @pytest.mark.parametrize("network", ["mem_mlp", "refined"])
 def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, network: str):
     source, path = step_files(network), tmp_path / "half.onnx"
-    stream = streaming(exported.NETWORKS[network]())
+    stream = make_streaming_graph(exported.NETWORKS[network]())
     write_lower_precision("fp16", source, path, stream, [])
     made, inner = onnx.load(path), set(find_inner_layers(onnx.load(source), stream.float32_modules))
     onnx.checker.check_model(made, full_check=True)
@@ -116,7 +116,7 @@ def test_a_product_in_blocks_is_that_of_the_rounded_weight():
 
 @pytest.mark.parametrize("cell", ["gru"])
 def test_only_cells_are_in_blocks_and_the_motion_is_near(tmp_path: Path, cell: str):
-    stream = streaming(tiny.recurrent_poser(Heading(), cell=cell, width=40))
+    stream = make_streaming_graph(tiny.recurrent_poser(Heading(), cell=cell, width=40))
     exact, path = tmp_path / "exact.onnx", tmp_path / "blocks.onnx"
     export(stream, exact, "0" * 16)
     write_lower_precision("int8_blocks", exact, path, stream, [])
@@ -141,7 +141,7 @@ def test_only_cells_are_in_blocks_and_the_motion_is_near(tmp_path: Path, cell: s
 def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     """The first tiny network's stream in float32 and in fp16."""
     exact, half = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "half.onnx"
-    write_lower_precision("fp16", exact, half, streaming(exported.NETWORKS["mem_mlp"]()), [])
+    write_lower_precision("fp16", exact, half, make_streaming_graph(exported.NETWORKS["mem_mlp"]()), [])
     return exact, half
 
 

@@ -28,7 +28,7 @@ from memmlp.deploy.parity import (
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.own_past_memory import MemoryWithoutCodes
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 
 pytestmark = pytest.mark.slow
 
@@ -76,7 +76,7 @@ def test_almost_parallel_columns_are_no_failure(tmp_path):
     model, path = exported.NETWORKS["agrol_mlp"](), tmp_path / "step.onnx"
     mean, std = (t[SPARSE_DIM:][ROTATION].view(22, 6) for t in (model.normalizer.mean, model.normalizer.std))
     mean[9, 3:], std[9] = mean[9, :3], 4e-3
-    export(streaming(model), path, "0123456789abcdef")
+    export(make_streaming_graph(model), path, "0123456789abcdef")
     with torch.no_grad():
         model.head.bias.view(22, 6)[9, 3] += 1e-3  # 4e-6 of the rotation, the rounding of a large network
     assert measure_largest_difference(model, path, CLIP) <= TOLERANCE

@@ -63,7 +63,7 @@ def test_what_diverged_in_the_position_branch_is_no_number_after_it():
 
 
 def test_the_objective_is_the_distance_that_is_measured():
-    """It is the sum of squares over joints, the head on its tracker, as by `Normalizer.pose`."""
+    """It is the sum of squares over joints, the head on its tracker, as by `Normalizer.compute_positions`."""
     motion = perturbed(0.3)
     target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
     expected = (NORMALIZER.compute_positions(motion, SPARSE) - target).square().sum((1, 2))

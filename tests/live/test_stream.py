@@ -31,7 +31,7 @@ from memmlp.live.tracker_resampling import make_t_pose
 from memmlp.live.wearer import Offsets
 from memmlp.motion.body import HEAD, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 from memmlp.runs.run import Run
 
 pytestmark = pytest.mark.slow
@@ -49,7 +49,7 @@ def network():
 @pytest.fixture(scope="module")
 def file(network, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("avatar") / "step.onnx"
-    export(streaming(network), path, "0123456789abcdef")
+    export(make_streaming_graph(network), path, "0123456789abcdef")
     return path
 
 

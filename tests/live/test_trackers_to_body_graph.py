@@ -27,7 +27,7 @@ from memmlp.live.trackers_to_body_graph import (
     measure_full_differences,
 )
 from memmlp.motion.geometry import axis_angle_to_matrix
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 
 pytestmark = pytest.mark.slow
 
@@ -91,7 +91,7 @@ def test_a_baseline_has_it_too(tmp_path: Path):
 def test_quaternions_come_out_on_demand(folder: Path):
     """They are those of the live stream, up to the sign."""
     file, network = folder / "quaternion.onnx", exported.NETWORKS["no_memory"]()
-    export_full(streaming(network), file, RUN, "openxr", "quaternion", opset=15)
+    export_full(make_streaming_graph(network), file, RUN, "openxr", "quaternion", opset=15)
     assert measure_full_differences(network, file, PERSON.frames, "openxr").max() <= TOLERANCE
     graph = onnx.load(file)
     onnx.checker.check_model(graph, full_check=True)

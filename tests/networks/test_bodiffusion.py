@@ -10,7 +10,7 @@ from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks import diffusion as ancestral
-from memmlp.networks.streaming import has_streaming_graph, streaming
+from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 
 CLIP = tiny.clip(25)
 TRUTH = tiny.clip(7)[None].expand(64, -1, -1)
@@ -73,7 +73,7 @@ def test_offline_it_is_no_stream():
     assert not model.is_stream
     assert not has_streaming_graph(model)
     with pytest.raises(InputError, match=r"model\.offline=true"):
-        streaming(model)
+        make_streaming_graph(model)
     report = Evaluation(["window"], 4, NoIK(), 0).report(model, tiny.frames((20,)), "window")
     assert report["offline"]
     assert "offline" not in Evaluation(["window"], 4, NoIK(), 0).report(

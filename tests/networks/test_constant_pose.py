@@ -18,7 +18,7 @@ from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.constant_pose import ConstantPose, ConstantPoseSettings
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 
 CLIP = tiny.clip(40)
 
@@ -78,7 +78,7 @@ def test_it_turns_with_the_head_and_with_nothing_else(model: ConstantPose):
 def test_its_file_is_the_network_and_has_nothing_in_a_lower_precision(
     model: ConstantPose, tmp_path: Path, precision: str
 ):
-    path, stream = tmp_path / "step.onnx", streaming(model)
+    path, stream = tmp_path / "step.onnx", make_streaming_graph(model)
     export(stream, path, "0123456789abcdef")
     assert measure_largest_difference(model, path, CLIP) <= TOLERANCE
     with pytest.raises(InputError, match=r"export\.precision"):

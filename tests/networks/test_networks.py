@@ -24,7 +24,7 @@ from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, MemoryWithoutCodes
 from memmlp.networks.predictor import RotationOnlySettings, TwoBranchMemorySettings, TwoBranchSettings
-from memmlp.networks.streaming import has_streaming_graph, streaming
+from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 
 
 def without_blocks() -> MemMLP:
@@ -94,7 +94,7 @@ def test_calls_modes_clips_and_the_graph_are_one_stream(name: str):
     if not model.settled:
         return
     before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
-    graph, carried = streaming(model), streaming(model).initial_state()
+    graph, carried = make_streaming_graph(model), make_streaming_graph(model).initial_state()
     live = []
     for frame in SPARSE.split(1, 1):
         motion, carried = graph.advance(frame, carried)
@@ -106,7 +106,7 @@ def test_calls_modes_clips_and_the_graph_are_one_stream(name: str):
 @pytest.mark.parametrize("name", ["mem_mlp", "avatar_poser", "agrol_diffusion", "sage"])
 def test_a_step_of_a_streaming_graph_is_less_work_than_a_whole_window(name: str):
     model = tiny.model() if name == "mem_mlp" else tiny.baseline(name)
-    assert count_macs(streaming(model)) < count_macs(model)
+    assert count_macs(make_streaming_graph(model)) < count_macs(model)
 
 
 class Different(type(tiny.baseline("avatar_poser"))):
@@ -115,13 +115,13 @@ class Different(type(tiny.baseline("avatar_poser"))):
 
 def test_a_network_without_a_streaming_graph_is_refused():
     with pytest.raises(InputError, match=r"memory\.history=first"):
-        streaming(tiny.model(CodeMemory, history="latest"))
+        make_streaming_graph(tiny.model(CodeMemory, history="latest"))
     model = tiny.baseline("avatar_poser")
     model.__class__ = Different
     for one in (model, tiny.refined(model)):
         assert not has_streaming_graph(one)
     with pytest.raises(InputError, match=r"export\.graph=streaming"):
-        streaming(model)
+        make_streaming_graph(model)
 
 
 @pytest.mark.slow

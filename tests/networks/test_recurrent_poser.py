@@ -14,7 +14,7 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.recurrent_poser import CELLS, RecurrentCell, scan_linear_recurrence
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 
 CLIP = tiny.clip(24)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
@@ -103,7 +103,7 @@ def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
         tmp_path / "step.onnx",
         tmp_path / "int8.onnx",
     )
-    stream = streaming(model)
+    stream = make_streaming_graph(model)
     export(stream, exact, "0" * 16)
     assert measure_largest_difference(model, exact, CLIP) <= TOLERANCE
     write_lower_precision("int8", exact, int8, stream, [CLIP[:20]])

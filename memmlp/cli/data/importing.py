@@ -113,7 +113,7 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_a
     """Compare imported clips with the files.
 
     The command imports each file and compares the result with the file's joints. It prints the largest
-    position error of a mapped joint, on the file's bone lengths, and the largest angle error of a segment
+    position error of a mapped joint, with the file's bone lengths, and the largest angle error of a segment
     (trunk, neck, arms, legs, feet). Impossible postures and lengths are faults. The command continues after
     bad files. It exits with 1 if a file has a fault or cannot be imported.
     """

@@ -79,14 +79,14 @@ def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:
 
 
 def show_pairs(label: str, pairs: Mapping[str, str], sign: str = " = ") -> None:
-    """Print the first few pairs of names, and the number of the others."""
+    """Print the first few pairs of names, and the number of further pairs."""
     show_some(
         [f"{label}: {escape_line_breaks(a)}{sign}{escape_line_breaks(b)}" for a, b in pairs.items()], label
     )
 
 
 def show_skipped(skipped: Sequence[SkippedFile]) -> None:
-    """Print the first few skipped files and the number of the others."""
+    """Print the first few skipped files, and the number of further files."""
     show_some([f"skipped {file.file}: {file.reason}" for file in skipped], "skipped")
 
 

@@ -31,7 +31,7 @@ from memmlp.live.wearer import compute_body_height
 from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED
 from memmlp.motion.limb_shapes import HEAT, LIMBS
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming import has_streaming_graph, streaming
+from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 
 ABOUT = "site.json"
 SPACE = SPACES["openxr"]  # the frame of reference of all poses on the site
@@ -193,7 +193,7 @@ def write_network(folder: Path, network: SiteNetwork) -> Entry:
     """Write a network's full graph into a site's folder, and return the network's entry in `site.json`."""
     announce(f"web: export {network.name}")
     model = network.model.cpu().eval()
-    graph = streaming(model) if has_streaming_graph(model) else model
+    graph = make_streaming_graph(model) if has_streaming_graph(model) else model
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(temporary) / "whole.onnx"
         export_full(graph, path, network.run, SPACE.name)

@@ -346,12 +346,12 @@ def _format_centimetres(metres: np.ndarray) -> str:
 def _format_motion(clip: Clip, rest: np.ndarray) -> Iterator[str]:
     yield from ("MOTION", f"Frames: {len(clip)}", f"Frame Time: {1 / clip.fps:.12f}")
 
-    def below(joint: int) -> Iterator[int]:  # in the hierarchy's order
+    def list_subtree(joint: int) -> Iterator[int]:  # in the hierarchy's order
         yield joint
         for child in _list_children(joint):
-            yield from below(child)
+            yield from list_subtree(child)
 
-    order, previous_angles = list(below(0)), None
+    order, previous_angles = list(list_subtree(0)), None
     for piece in clip.split_into_pieces():
         rotations, root = convert_to_y_up(piece, rest)
         angles = compute_euler_zxy(rotations, previous_angles)
@@ -370,7 +370,7 @@ def compute_euler_zxy(rotations: np.ndarray, previous_angles: np.ndarray | None 
 
     Args:
         rotations: rotation matrices.
-        before: angles (..., 3) of the frame before the first frame, degrees, if there is one.
+        previous_angles: angles (..., 3) of the frame before the first frame, degrees, if there is one.
     """
     z = np.arctan2(-rotations[..., 0, 1], rotations[..., 1, 1])
     cosine, sine = np.cos(z)[..., None], np.sin(z)[..., None]
@@ -387,12 +387,12 @@ def compute_euler_zxy(rotations: np.ndarray, previous_angles: np.ndarray | None 
 def _make_continuous(angles: np.ndarray) -> np.ndarray:
     """Return equivalent angles Z X Y (N, ..., 3), radians, without jumps between frames."""
 
-    def without_turns(angles: np.ndarray) -> np.ndarray:
+    def remove_full_turns(angles: np.ndarray) -> np.ndarray:
         return np.remainder(angles + np.pi, 2 * np.pi) - np.pi
 
     others = np.array([np.pi, np.pi, np.pi]) + np.array([1, -1, 1]) * angles  # equivalent angles
-    steps = without_turns(angles[1:] - angles[:-1])
-    changed = without_turns(others[1:] - angles[:-1])
+    steps = remove_full_turns(angles[1:] - angles[:-1])
+    changed = remove_full_turns(others[1:] - angles[:-1])
     changes = np.abs(changed).sum(-1) < np.abs(steps).sum(-1)
     second = np.zeros(angles.shape[:-1], bool)
     second[1:] = np.cumsum(changes, axis=0) % 2  # the second change selects the first triple again

@@ -154,20 +154,20 @@ def _build_animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, 
     }
 
 
-def compute_continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+def compute_continuous_quaternions(rotations: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
     """Convert rotations (N, J, 3, 3) to unit quaternions xyzw (N, J, 4).
 
     A rotation has two quaternions. Each frame gets the quaternion nearer to the previous frame.
 
     Args:
         rotations: rotation matrices.
-        before: quaternions (J, 4) of the frame before the first frame, if there is one.
+        previous: quaternions (J, 4) of the frame before the first frame, if there is one.
     """
     quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
     away = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0
     quaternions[1:] *= np.cumprod(np.where(away, -1, 1), axis=0)
-    if before is not None:
-        quaternions *= np.where((quaternions[0] * before).sum(-1, keepdims=True) < 0, -1, 1)
+    if previous is not None:
+        quaternions *= np.where((quaternions[0] * previous).sum(-1, keepdims=True) < 0, -1, 1)
     return quaternions
 
 

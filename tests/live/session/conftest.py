@@ -12,7 +12,7 @@ import wearer
 from memmlp.deploy.export import export
 from memmlp.live.session.sources import TrackedClip
 from memmlp.networks.memory import NoMemory
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 
 PERSON = wearer.person(np.arange(121) / 60)
 
@@ -21,7 +21,9 @@ PERSON = wearer.person(np.arange(121) / 60)
 def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Export a network with random weights whose pose is near that of a person who stands."""
     path = tmp_path_factory.mktemp("player") / "step.onnx"
-    export(streaming(wearer.at_ease(tiny.model(NoMemory), PERSON.frames)), path, "0123456789abcdef")
+    export(
+        make_streaming_graph(wearer.at_ease(tiny.model(NoMemory), PERSON.frames)), path, "0123456789abcdef"
+    )
     return path
 
 

@@ -20,7 +20,7 @@ from memmlp.deploy.export import export
 from memmlp.live.web.site import Site, SiteNetwork, pack_clip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import make_streaming_graph
 
 RUN = "0123456789abcdef"
 REMARK = "hardly trained, in a test"
@@ -60,7 +60,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
                 networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,), REMARK)],
                 clips=[clip],
             ).write(made.folder)
-            export(streaming(network()), made.step, RUN)
+            export(make_streaming_graph(network()), made.step, RUN)
     return made
 
 
