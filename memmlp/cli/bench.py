@@ -1,4 +1,4 @@
-"""`memmlp bench latency`: time network steps and poses on this machine."""
+"""`memmlp bench`: time network steps, poses and training steps on this machine."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from memmlp.cli.options import config_dir_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.deploy.latency import RoundTimes
+    from memmlp.training.step_cost import StepCost
 
 BASE = "avatar_poser"
 """The reference network of all ratios, with its default size."""
@@ -180,3 +181,68 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
 def shorten_number(number: float) -> str:
     """Return a number in at most four characters, so that a row fits a line of 80."""
     return f"{number:.2f}" if number < 10 else f"{number:.1f}" if number < 100 else f"{number:.0f}"
+
+
+@bench.command("train")
+@click.option(
+    "--rounds", default=5, show_default=True, type=click.IntRange(1), help="Number of timed rounds."
+)
+@click.option(
+    "--steps", default=10, show_default=True, type=click.IntRange(1), help="Number of steps per round."
+)
+@click.option("--profile", "kernels", is_flag=True, help="Also print the slowest functions of torch.")
+@click.argument("overrides", nargs=-1)
+@config_dir_option
+@plugins_option
+def train(rounds: int, steps: int, kernels: bool, overrides: tuple[str, ...]) -> None:
+    """Time a training step, and its matrix products alone.
+
+    OVERRIDES are those of `memmlp train`. The step runs on one thread of the CPU; times are processor times.
+    Each round times some steps, then the same matrix products by themselves. A VQ-VAE has random weights,
+    which does not affect the times; other prerequisite runs are trained if they are missing.
+    """
+    import numpy as np
+
+    cost = measure_training_step(overrides, rounds, steps, kernels)
+    step, products, ratio = map(np.median, (cost.step_ms, cost.product_ms, cost.ratios))
+    print(f"milliseconds on one thread, median of {rounds} rounds of {steps} steps")
+    print(f"{step:8.2f} training step")
+    print(f"{products:8.2f} its matrix products alone, {cost.flops / 1e9:.3g} GFLOP")
+    print(f"{ratio:8.2f} times the products, from {cost.ratios.min():.2f} to {cost.ratios.max():.2f}")
+    for name, milliseconds, calls in cost.kernels[:20]:
+        print(f"{milliseconds:8.2f} {name}, {calls:g} calls")
+
+
+def measure_training_step(
+    overrides: tuple[str, ...], rounds: int, steps: int, with_kernels: bool
+) -> StepCost:
+    """Measure the training step that overrides configure; see `measure_step_cost`."""
+    import torch
+
+    from memmlp.common.errors import InputError
+    from memmlp.config.build import build_experiment
+    from memmlp.config.compose import compose_config
+    from memmlp.networks import checkpoint
+    from memmlp.training.run_stages import make_prerequisites
+    from memmlp.training.step_cost import measure_step_cost
+    from memmlp.training.train_network import NetworkTraining
+
+    experiment = build_experiment(compose_config(overrides))
+    training, architecture = experiment.training, experiment.architecture
+    if experiment.device.type != "cpu":
+        raise InputError(f"device={experiment.config['device']}: must be cpu, whose time is measured")
+    if not isinstance(training, NetworkTraining):
+        raise InputError("refiner: must be null, since the steps of a network's training are timed")
+    training.optim.check_installed()
+    data = experiment.motion.prepare()
+    with tempfile.TemporaryDirectory() as folder:
+        weights = None
+        if architecture.uses_codes:
+            torch.manual_seed(0)
+            weights = Path(folder) / "vqvae.safetensors"
+            codes = checkpoint.collect_module_tensors("model", architecture.vqvae())
+            checkpoint.write(weights, codes, {})
+        elif run := make_prerequisites(experiment, data):
+            weights = run.weights()
+        task = training.make_task(architecture, data, weights, experiment.device)
+    return measure_step_cost(task, training.optim, rounds, steps, with_kernels)

@@ -1,4 +1,4 @@
-"""`memmlp bench latency` times every graph; AvatarPoser is the published network."""
+"""`memmlp bench` times every graph and a training step; AvatarPoser is the published network."""
 
 from __future__ import annotations
 
@@ -91,3 +91,12 @@ def test_models_include_the_one_that_others_are_compared_with(memmlp: Memmlp):
     assert one_line(memmlp("bench", "latency", "--models", "mem_mlp@41"), "--models", "avatar_poser")
     for word in ("model=rpm", "model.frames=9"):
         assert one_line(memmlp("bench", "latency", word), word, "--models")
+
+
+@pytest.mark.slow
+def test_a_training_step_is_timed_beside_its_products(memmlp: Memmlp):
+    assert one_line(memmlp("bench", "train", "profile=tiny", "refiner=sage"), "refiner")
+    ran = memmlp("bench", "train", "profile=tiny", "--rounds", "1", "--steps", "2")
+    assert ran.code == 0, ran.err
+    _, step, products, ratio = (line.split() for line in ran.out.splitlines()[-4:])
+    assert float(ratio[0]) == pytest.approx(float(step[0]) / float(products[0]), rel=0.1)
