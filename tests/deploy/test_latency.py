@@ -20,7 +20,7 @@ NETWORKS = {
     **{name: lambda name=name: tiny.baseline(name) for name in ("agrol_mlp", "avatar_jlm", "manikin_s")},
     "mem_mlp": tiny.model,
     "recurrent_poser": tiny.recurrent_poser,
-    "refined": tiny.refined,
+    "refined": lambda: tiny.refined(tiny.recurrent_poser()),
 }
 
 
