@@ -57,18 +57,18 @@ def evaluate(
     from memmlp.training.request import read_clip_rows
     from memmlp.training.run_stages import complete_stages
 
-    found = open_run(outputs, run, device, overrides)
-    experiment = found.experiment
-    results, made = complete_stages(experiment, found.run, found.data, again=again)
-    outcome = f"{' and '.join(made)} done" if made else "measured before"
-    click.echo(f"run {found.run.id}: {outcome}")
-    facts = [found.run.manifest.get(fact) for fact in ("resampled", "unusual")]
-    for line in (*filter(None, facts), *list_run_warnings(found.run)):
+    opened = open_run(outputs, run, device, overrides)
+    experiment = opened.experiment
+    results, stages = complete_stages(experiment, opened.run, opened.data, again=again)
+    outcome = f"{' and '.join(stages)} done" if stages else "measured before"
+    click.echo(f"run {opened.run.id}: {outcome}")
+    facts = [opened.run.manifest.get(fact) for fact in ("resampled", "unusual")]
+    for line in (*filter(None, facts), *list_run_warnings(opened.run)):
         click.echo(line)
-    for table in (make_metrics_table(results), *make_source_tables(found.run, experiment.stage_ids)):
+    for table in (make_metrics_table(results), *make_source_tables(opened.run, experiment.stage_ids)):
         Console(highlight=False).print(table)
     if json_path is not None:
-        write_json(json_path, {"mean": results, "clips": read_clip_rows(experiment, found.run)})
+        write_json(json_path, {"mean": results, "clips": read_clip_rows(experiment, opened.run)})
     if save_predictions is not None:
-        write_predictions(experiment.evaluation, found.network(), found.test, save_predictions)
-        click.echo(f"predictions of {len(found.test.names)} clips in {save_predictions}")
+        write_predictions(experiment.evaluation, opened.network(), opened.test, save_predictions)
+        click.echo(f"predictions of {len(opened.test.names)} clips in {save_predictions}")

@@ -314,12 +314,12 @@ def make_outputs(options: LiveOptions, stream: Stream) -> Outputs:
     """Return the outputs that the options request."""
     from memmlp.live.outputs import VMC, VMC_PORT, VRCHAT_PORT, Outputs, Receiver, Recorder, VRChat
 
-    found: list[Output] = [VMC(Receiver(host, port or VMC_PORT, "--vmc")) for host, port in options.vmc]
-    found += [VRChat(Receiver(host, port or VRCHAT_PORT, "--vrchat")) for host, port in options.vrchat]
+    outputs: list[Output] = [VMC(Receiver(host, port or VMC_PORT, "--vmc")) for host, port in options.vmc]
+    outputs += [VRChat(Receiver(host, port or VRCHAT_PORT, "--vrchat")) for host, port in options.vrchat]
     if options.record:
         network = stream.network
-        found.append(Recorder(options.record, network.body.rest, network.fps, print_note))
-    return Outputs(found, print_note)
+        outputs.append(Recorder(options.record, network.body.rest, network.fps, print_note))
+    return Outputs(outputs, print_note)
 
 
 def print_note(line: str) -> None:

@@ -65,7 +65,6 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
 
 
 def _make_loggers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[RunLogger]:
-    """Return the named loggers. Raises InputError if a package is missing."""
     from memmlp.runs.loggers.mlflow import MLflow
     from memmlp.runs.loggers.tensorboard import TensorBoard
     from memmlp.runs.loggers.wandb import WandB

@@ -70,23 +70,23 @@ def predict(
     from memmlp.motion.exporting import plan_export
     from memmlp.runs.lookup import find_run
 
-    found = find_run(outputs, run)
-    experiment = build_run_experiment(found, device, [] if ik is None else [f"evaluation.ik={ik}"])
+    opened_run = find_run(outputs, run)
+    experiment = build_run_experiment(opened_run, device, [] if ik is None else [f"evaluation.ik={ik}"])
     chosen = choose_branch(experiment.evaluation, branch)
     interpolation = experiment.motion.clips.interpolation
     predictor = ClipPredictor(
-        load_network(found, experiment), mode, chosen, experiment.evaluation, interpolation
+        load_network(opened_run, experiment), mode, chosen, experiment.evaluation, interpolation
     )
     if Path(source).exists():
         plan = plan_export(Path(source), out, format_)
         check_imported_body([target.source for target in plan.targets], predictor.rest, "the network")
         report = predictor.export(plan, strict=strict)
     else:
-        opened = OpenedRun(found, experiment, load_run_data(found, experiment))
+        opened = OpenedRun(opened_run, experiment, load_run_data(opened_run, experiment))
         report = predict_test_clip(predictor, opened, source, out, format_)
-    click.echo(f"run {found.id}: {chosen}, {mode} mode")
+    click.echo(f"run {opened_run.id}: {chosen}, {mode} mode")
     show_exported(report, out)
-    warn_about_training(found)
+    warn_about_training(opened_run)
 
 
 def choose_branch(evaluation: Evaluation, branch: str | None) -> str:
@@ -118,8 +118,8 @@ def predict_test_clip(
 
     chosen, test = choose_format(out, format_, folder=False), run.test
     if name not in test.names:
-        known = ", ".join(test.names)
-        raise InputError(f"SOURCE {name}: must be a file, a folder, or a test clip of the run: {known}")
+        names = ", ".join(test.names)
+        raise InputError(f"SOURCE {name}: must be a file, a folder, or a test clip of the run: {names}")
     (clip,) = predictor.predict([name], [test.read_clip(test.names.index(name))])
     write_motion(out, clip, predictor.rest, chosen)
     return ExportReport((out,), len(clip) / FPS, ())

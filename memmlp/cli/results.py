@@ -125,9 +125,9 @@ def show(name: str, source: str | None, together: tuple[str, ...], folder: Path)
 
     path = folder / "data" / f"{name}.json"
     if not path.is_file():
-        known = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
+        names = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
         raise InputError(
-            f"{path}: no results with this name; must be one of: {known or '(no results are kept)'}"
+            f"{path}: no results with this name; must be one of: {names or '(no results are kept)'}"
         )
     print_tables([_make_table(load_kept_results(path), source, together)])
 
@@ -175,13 +175,13 @@ def make_tables(folder: Path) -> dict[str, KeptTable]:
         raise InputError(
             f"{folder}/data: no such folder; create it with: memmlp results save --out {folder}/data"
         )
-    found = {}
+    tables = {}
     for path in sorted((folder / "data").glob("*.json")):
         kept = load_kept_results(path)
         sources = () if kept.rounds else kept.sources  # verdicts by seed rounds need all clips
         by_source = tuple(_make_table(kept, source) for source in sources)
-        found[path.stem] = KeptTable(kept, _make_table(kept), by_source, partial(_make_table, kept, None))
-    return found
+        tables[path.stem] = KeptTable(kept, _make_table(kept), by_source, partial(_make_table, kept, None))
+    return tables
 
 
 def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence[str] = ()) -> Table:

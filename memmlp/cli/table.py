@@ -96,15 +96,15 @@ def table(
     selection = TableSelection(branch, source, together, untrained)
     gc.disable()  # garbage collection takes a second and finds nothing here
     try:
-        found = gather_tables(
+        results = gather_tables(
             name, overrides, outputs, SHOWN_MODES[mode], functools.cache(load_measured_run), selection
         )
     finally:
         gc.enable()
     if seeds_needed:
-        print_needed_seeds(found, SHOWN_MODES[mode])
+        print_needed_seeds(results, SHOWN_MODES[mode])
         return
-    tables = [one.table for one in found]
+    tables = [one.table for one in results]
     if form is None and out is None:
         print_tables(tables)
         return
@@ -115,12 +115,12 @@ def table(
         write(out, text)
 
 
-def print_needed_seeds(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
+def print_needed_seeds(tables: Sequence[SweepTable], modes: Sequence[str]) -> None:
     """Print the number of seeds that the paper's effects need, for each sweep."""
     from memmlp.report.tables.effects import compute_needed_seeds
     from memmlp.report.tables.table_text import make_caption
 
-    for one in found:
+    for one in tables:
         rows = [("variant", "mode", "metric", "paper", "here", "seeds", "needed")]
         for row in compute_needed_seeds(one.sweep, one.runs, modes):
             numbers = f"{row.paper:+.2f}", f"{row.measured:+.2f}", str(row.seeds)
@@ -182,7 +182,7 @@ def gather_tables(
     from memmlp.common.progress import progress_bar
     from memmlp.report.tables.build_table import make_empty_table
 
-    found, failures = [], []
+    tables, failures = [], []
     sweeps = find_sweeps(name, overrides)
     for sweep, command in progress_bar(sweeps, "tables") if len(sweeps) > 1 else sweeps:
         sweep = sweep.with_branch(selection.branch) if selection.branch else sweep
@@ -192,15 +192,15 @@ def gather_tables(
             check_costs(sweep)
         try:
             shown = load_shown_sweep(sweep, overrides, outputs.absolute())
-            found.append(make_plan_table(shown, modes, command, read, selection))
+            tables.append(make_plan_table(shown, modes, command, read, selection))
         except InputError as error:
             failures.append(error)
             table = make_empty_table(sweep, modes, f"nothing measured: {error}")
-            found.append(SweepTable(sweep, {variant.label: {} for variant in sweep.list_runnable()}, table))
-    asked = overrides or selection.source or selection.together or found[0].sweep.table is None
-    if failures and asked and len(failures) == len(found):
+            tables.append(SweepTable(sweep, {variant.label: {} for variant in sweep.list_runnable()}, table))
+    has_selection = overrides or selection.source or selection.together or tables[0].sweep.table is None
+    if failures and has_selection and len(failures) == len(tables):
         raise failures[0]
-    return found
+    return tables
 
 
 def make_plan_table(

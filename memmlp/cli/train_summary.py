@@ -95,9 +95,9 @@ def _list_distinct_branches(branches: Mapping[str, Mapping[str, Any]]) -> list[s
     """Return the branches with distinct positions; a network without a position branch has only one."""
     differing: list[str] = []
     for branch in (branch for branch in BRANCHES if branch in branches):
-        own = branches[branch][SHARED_METRIC]
+        errors = branches[branch][SHARED_METRIC]
         if not any(
-            math.isclose(own, branches[other][SHARED_METRIC], rel_tol=SAME_ERROR_TOLERANCE)
+            math.isclose(errors, branches[other][SHARED_METRIC], rel_tol=SAME_ERROR_TOLERANCE)
             for other in differing
         ):
             differing.append(branch)
@@ -129,10 +129,10 @@ def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
             f"an end-to-end pose, trackers to joints: {measured['pose_median_ms']:.2f} ms median, "
             f"{measured['pose_p95_ms']:.2f} ms p95 (timed with the network in the caches)"
         )
-    own, whole = measured["parameters"], measured["parameters_with_vqvae"]
-    others = f" ({whole / 1e6:.2f} M including frozen and training-only parts)" if whole != own else ""
+    trained, whole = measured["parameters"], measured["parameters_with_vqvae"]
+    others = f" ({whole / 1e6:.2f} M including frozen and training-only parts)" if whole != trained else ""
     yield (
-        f"{own / 1e6:.2f} M parameters{others}, {measured['macs'] / 1e6:.3g} MMAC a frame, "
+        f"{trained / 1e6:.2f} M parameters{others}, {measured['macs'] / 1e6:.3g} MMAC a frame, "
         f"ONNX file {measured['onnx_bytes'] / 1e6:.1f} MB, graph included"
     )
 

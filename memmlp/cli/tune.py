@@ -179,7 +179,6 @@ def _make_tasks(setup: SearchSetup, values: Mapping[str, Value]) -> list[Sequenc
 
 
 def _make_requests(setup: SearchSetup, values: Mapping[str, Value]) -> list[RunRequest]:
-    """Return the checked requests of a trial, one for each seed."""
     from memmlp.config.build_request import build_request
     from memmlp.config.compose import compose_config
 

@@ -93,10 +93,10 @@ class Workers:
         """
         from memmlp.sweep.executors.local import divide_gpus, list_visible_gpus
 
-        wanted = [name for name in devices if name not in DEVICES_WITHOUT_GPU]
+        gpu_devices = [name for name in devices if name not in DEVICES_WITHOUT_GPU]
         local = self.executor == "local"
-        gpus = list_visible_gpus() if wanted and local and self.gpus_per_worker != 0 else ()
-        for name in wanted:
+        gpus = list_visible_gpus() if gpu_devices and local and self.gpus_per_worker != 0 else ()
+        for name in gpu_devices:
             if ":" in name:
                 raise InputError(
                     f"device={name}: expected auto, cuda, cpu or mps; each worker has its own GPU"
@@ -188,21 +188,21 @@ def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple
     Raises:
         InputError: for an unknown executor, or settings of another executor.
     """
-    executor, own, remaining = "local", [], []
+    executor, executor_settings, remaining = "local", [], []
     for override in map(Override.parse, overrides):
         if override.key == "executor":
             executor = override.value or ""
         elif override.group in (*EXECUTORS_WITH_SETTINGS, CUSTOM_PREFIX):
-            own.append(override)
+            executor_settings.append(override)
         else:
             remaining.append(override.text)
     if executor not in EXECUTORS and "." not in executor:
         raise InputError(f"executor={executor}: expected local, slurm, ray or the path of a class")
-    for override in own:
+    for override in executor_settings:
         if override.group != (CUSTOM_PREFIX if "." in executor else executor):
             name = "PATH, a custom executor" if override.group == CUSTOM_PREFIX else override.group
             raise InputError(f"{override.key}: needs executor={name}")
-    settings = {one.key.partition(".")[2]: one.value or "" for one in own}
+    settings = {one.key.partition(".")[2]: one.value or "" for one in executor_settings}
     return executor, settings, tuple(remaining)
 
 
@@ -230,10 +230,10 @@ def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[st
     count = workers.count_workers(shares)
     may_use_gpu = not named <= DEVICES_WITHOUT_GPU
     executor = workers.start_executor(folder, shares, may_use_gpu)
-    own = folder / "controllers" / uuid4().hex
-    path = own.with_suffix(".json")
+    stem = folder / "controllers" / uuid4().hex
+    path = stem.with_suffix(".json")
     plan.save(path)
-    presence = Presence(own.with_suffix(".process"))
+    presence = Presence(stem.with_suffix(".process"))
     gpu = executor.gpus and may_use_gpu
     local = workers.executor == "local"
     threads = max((os.cpu_count() or 1) // count, 1) if local else 0

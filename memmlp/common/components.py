@@ -170,16 +170,16 @@ def collect_components() -> dict[tuple[str, str], Component]:
     Raises:
         InputError: if two packages declare the same option.
     """
-    found: dict[tuple[str, str], Component] = {}
+    components: dict[tuple[str, str], Component] = {}
     for package, root in _roots.items():
         for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
             for one in _parse_components(package, path):
-                if other := found.get((one.slot, one.name)):
+                if other := components.get((one.slot, one.name)):
                     raise InputError(
                         f"{path}: {one.slot}={one.name} exists already in {other.path}; rename one of them"
                     )
-                found[one.slot, one.name] = one
-    return found
+                components[one.slot, one.name] = one
+    return components
 
 
 def add_package(package: str, root: Path | None) -> None:

@@ -141,9 +141,9 @@ def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
         return
     import torch
 
-    found = [one.grad for one in parameters if one.grad is not None]
-    means = average(torch.cat([grad.flatten() for grad in found]))
-    for grad, part in zip(found, means.split([grad.numel() for grad in found]), strict=True):
+    gradients = [one.grad for one in parameters if one.grad is not None]
+    means = average(torch.cat([grad.flatten() for grad in gradients]))
+    for grad, part in zip(gradients, means.split([grad.numel() for grad in gradients]), strict=True):
         grad.copy_(part.view_as(grad))
 
 

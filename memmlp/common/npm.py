@@ -85,17 +85,17 @@ def read_package_files(package: Package, names: Collection[str]) -> dict[str, by
         InputError: if the package can't be downloaded.
         KeyError: if the package does not have a file.
     """
-    found = {}
+    contents = {}
     with tarfile.open(fetch_tarball(package), "r:gz") as archive:
         for member in archive:
             name = member.name.split("/", 1)[-1]  # all lie in one folder, usually "package"
             if member.isfile() and name in names and (file := archive.extractfile(member)):
-                found[name] = file.read()
-            if len(found) == len(set(names)):
+                contents[name] = file.read()
+            if len(contents) == len(set(names)):
                 break  # the rest need not be unpacked
-    if missing := sorted(set(names) - set(found)):
+    if missing := sorted(set(names) - set(contents)):
         raise KeyError(f"{package} does not have {', '.join(missing)}")
-    return found
+    return contents
 
 
 def fetch_tarball(package: Package) -> Path:
@@ -130,7 +130,6 @@ def registry_url() -> str:
 
 
 def _download(package: Package, host: str) -> bytes:
-    """Download a package's tarball. Raises InputError if the download fails or has a wrong digest."""
     announce(f"download {package} from the npm registry and keep it in {cache_folder()}")
     instead = f"or run npm pack {package} and set {FOLDER} to the folder with {package.file}"
     try:

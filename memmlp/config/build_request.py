@@ -82,8 +82,6 @@ def read_source_weights(data: DictConfig) -> Mapping[str, float] | None:
 
 
 class _ClipRequest(NamedTuple):
-    """The folders of the clips, and the split."""
-
     root: Root
     split: Split
 
@@ -106,7 +104,6 @@ def _build_clip_request(data: DictConfig) -> _ClipRequest:
 
 
 def _build_source_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
-    """Return the split of a source, with the source's groups and fractions."""
     fractions = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
     groups = [*split.groups, *(source.get("groups") or ())]
     try:

@@ -56,9 +56,9 @@ def _list_values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]
             if isinstance(node[name], DictConfig):
                 yield from _list_values(node[name], f"{prefix}{name}.")
         return
-    known = [spec.name for spec in dataclasses.fields(schema)]
-    for extra in sorted(set(map(str, node)) - set(known)):
-        raise InputError(describe_unknown_key(prefix + extra, known))
+    keys = [spec.name for spec in dataclasses.fields(schema)]
+    for extra in sorted(set(map(str, node)) - set(keys)):
+        raise InputError(describe_unknown_key(prefix + extra, keys))
     for spec in dataclasses.fields(schema):
         name = prefix + spec.name
         value = _read_value(node, spec.name, name)
@@ -78,7 +78,6 @@ def describe_unknown_key(name: str, keys: Sequence[str]) -> str:
 
 
 def _read_value(node: DictConfig, own: str, name: str) -> Any:
-    """Return a key's value. Raises InputError if it is missing or cannot be resolved."""
     if OmegaConf.is_missing(node, own):
         raise InputError(f"{name}: has no value; set {name}=VALUE")
     try:
@@ -201,7 +200,6 @@ def _describe_type(hint: Any) -> str:
 
 
 def _explain_composition(text: str) -> str:
-    """Return Hydra's error message in one line, without its advice."""
     ambiguous = re.match(r"Ambiguous value for argument '(.*)'", text)
     if ambiguous:
         return f"{ambiguous[1]}: expected one value, a list [a,b], or several values with -m"

@@ -131,7 +131,7 @@ def find_experiment_keys(options: Sequence[str], overrides: Sequence[str] = ()) 
         *(folder for _, folder in plugins.list_config_folders()),
         *_list_search_path(overrides),
     ]
-    found, pending, seen = set[str](), list(options), set[str]()
+    keys, pending, seen = set[str](), list(options), set[str]()
     while pending:
         name = pending.pop().removeprefix(f"/{EXPERIMENT}/")
         paths = (folder / EXPERIMENT / f"{name}.yaml" for folder in folders)
@@ -143,11 +143,11 @@ def find_experiment_keys(options: Sequence[str], overrides: Sequence[str] = ()) 
             for group, option in entry.items() if isinstance(entry, dict) else [(EXPERIMENT, entry)]:
                 sign, _, target = str(group).partition("@")[0].rpartition(" ")
                 if sign == "override":
-                    found.add(target.lstrip("/"))
+                    keys.add(target.lstrip("/"))
                 elif target.lstrip("/") == EXPERIMENT:
                     pending += option if isinstance(option, list) else [str(option)]
-        found |= flatten(content).keys()
-    return found
+        keys |= flatten(content).keys()
+    return keys
 
 
 def check_overrides(args: argparse.Namespace) -> None:
@@ -265,8 +265,8 @@ def _make_node(slot: str, name: str) -> DictConfig | None:
     """Return the typed keys of a component or YAML file; None if only Hydra can compose them."""
     path = find_packaged_folder("conf") / slot / f"{name}.yaml"
     if not path.is_file():
-        found = collect_components().get((slot, name))
-        return OmegaConf.structured(found.settings) if found else None
+        component = collect_components().get((slot, name))
+        return OmegaConf.structured(component.settings) if component else None
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     match content.pop("defaults", None):
         case [str(other), "_self_"] if (base := _make_node(slot, other)) is not None:
@@ -355,9 +355,9 @@ def _initialize_hydra(args: argparse.Namespace) -> Iterator[None]:
     """Initialise Hydra with the search path of the arguments, within the context."""
     _check_hidden(args)
     main = _find_folder(args.config_path or find_packaged_folder("conf"), "--config-path")
-    own = _find_folder(args.config_dir, "--config-dir") if args.config_dir else None
+    folder = _find_folder(args.config_dir, "--config-dir") if args.config_dir else None
     with (
-        plugins.search_folder(own) if own else nullcontext(),
+        plugins.search_folder(folder) if folder else nullcontext(),
         initialize_config_dir(str(main), job_name="train", version_base=VERSION_BASE),
     ):
         yield
@@ -381,14 +381,13 @@ def _check_hidden(args: argparse.Namespace) -> None:
                 raise InputError(f"{path}: memmlp already has an option with this name; rename the file")
         for other in before:
             for path in sorted(other.rglob("*.yaml")):
-                own = folder / path.relative_to(other)
-                if own.is_file() and own.read_bytes() != path.read_bytes():
-                    raise InputError(f"{own}: Hydra would use {path} instead; rename the file")
+                hidden = folder / path.relative_to(other)
+                if hidden.is_file() and hidden.read_bytes() != path.read_bytes():
+                    raise InputError(f"{hidden}: Hydra would use {path} instead; rename the file")
         before.append(folder)
 
 
 def _list_search_path(overrides: Sequence[str]) -> list[Path]:
-    """Return the local folders in overrides of `hydra.searchpath`."""
     places = [one for word in parse_overrides(overrides) if word.key == SEARCHPATH for one in word.options]
     local = [place for place in places if "://" not in place or place.startswith("file://")]
     return [Path(place.removeprefix("file://")).absolute() for place in local]

@@ -51,21 +51,21 @@ def check_preset(sweep: Sweep, variant: Variant) -> None:
     """
     from memmlp.config.compose import EXPERIMENT, find_experiment_keys
 
-    own = {parse_key(word): word for word in variant.overrides or ()}
-    chosen = own.get(EXPERIMENT)
+    variant_words = {parse_key(word): word for word in variant.overrides or ()}
+    chosen = variant_words.get(EXPERIMENT)
     if chosen is None:
         return
     others = variant.own_overrides if chosen in variant.cell else ()
     around = {parse_key(word): word for word in (*sweep.base, *sweep.command_line)}
-    around = {key: word for key, word in around.items() if key not in own or key == EXPERIMENT}
+    around = {key: word for key, word in around.items() if key not in variant_words or key == EXPERIMENT}
     before, options = Override.parse(around.pop(EXPERIMENT, "")).options, Override.parse(chosen).options
     where = f"sweep {sweep.name}, variant '{variant.label}': {chosen}"
     if options and (lost := [option for option in before if option not in options]):
         both = ",".join(dict.fromkeys([*before, *options]))
         raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; use {EXPERIMENT}=[{both}]")
-    known = find_experiment_keys(options, sweep.merge_overrides(variant))
+    preset_keys = find_experiment_keys(options, sweep.merge_overrides(variant))
     for key, word in (around | {parse_key(word): word for word in others}).items():
-        if key in known:
+        if key in preset_keys:
             raise InputError(f"{where} sets {key}, and {word} would override it; remove it or the experiment")
 
 
@@ -160,21 +160,21 @@ def make_tasks(request: RunRequest, data: str) -> list[RunTask]:
     from memmlp.training.request import remove_refiner
 
     bare = remove_refiner(request.config) if request.config["refiner"] is not None else request.config
-    *before, own = request.identities(data)
+    *prerequisites, identity = request.identities(data)
     tasks: list[RunTask] = []
-    for one in before:
+    for one in prerequisites:
         tasks.append(RunTask(one.id, one.kind, bare, tasks[-1].id if tasks else None))
     last = tasks[-1].id if tasks else None
-    return [*tasks, RunTask(own.id, own.kind, request.config, last, request.stage_ids)]
+    return [*tasks, RunTask(identity.id, identity.kind, request.config, last, request.stage_ids)]
 
 
-def _find_data_digest(request: RunRequest, prepare: bool, known: dict[str, str | None]) -> str | None:
+def _find_data_digest(request: RunRequest, prepare: bool, digests: dict[str, str | None]) -> str | None:
     """Return the digest of a request's prepared data. Digests are cached in `known` by data config.
 
     Returns:
         None if the data is not prepared.
     """
     key = digest([request.config["data"], request.config["paths"]])
-    if key not in known:
-        known[key] = request.motion.prepare().digest if prepare else request.motion.find_digest()
-    return known[key]
+    if key not in digests:
+        digests[key] = request.motion.prepare().digest if prepare else request.motion.find_digest()
+    return digests[key]

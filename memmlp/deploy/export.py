@@ -153,8 +153,8 @@ def simplify(model: onnx_ir.Model) -> None:
     SIMPLER(model)
     graph = model.graph
     graph.metadata_props.clear()
-    made = (value for node in graph for value in node.outputs)
-    for noted in (*graph, *made, *graph.inputs, *graph.outputs, *graph.initializers.values()):
+    outputs = (value for node in graph for value in node.outputs)
+    for noted in (*graph, *outputs, *graph.inputs, *graph.outputs, *graph.initializers.values()):
         noted.metadata_props.clear()
 
 

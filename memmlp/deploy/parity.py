@@ -77,12 +77,12 @@ def measure_differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
     sometimes produce such columns.
     """
     model, clip = model.cpu().eval(), clip.cpu()
-    expected, found = stream_torch(model, clip), stream_onnx(OnnxStream(path), clip)
+    expected, exported = stream_torch(model, clip), stream_onnx(OnnxStream(path), clip)
     if "position" not in model.branches:
         exact = copy.deepcopy(model.normalizer).double()
-        positions = exact.compute_positions(found.double(), clip[:, :SPARSE_DIM].double())
+        positions = exact.compute_positions(exported.double(), clip[:, :SPARSE_DIM].double())
         expected = torch.cat([expected[:, ROTATION], positions.flatten(1)], 1)
-    return (expected - found).abs().amax(1)
+    return (expected - exported).abs().amax(1)
 
 
 def is_rounding(apart: Tensor) -> bool:

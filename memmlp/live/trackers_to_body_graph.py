@@ -226,12 +226,12 @@ def measure_full_differences(model: MotionModel, path: Path, clip: Tensor, space
         reference.convert_rotations_from_amass(rotations.numpy()),
     )
     steps = [stream.step(*(part[index : index + 1] for part in inputs)) for index in range(len(clip) + 1)]
-    found = [
+    outputs = [
         np.concatenate(parts)[1:] for parts in zip(*steps, strict=True)
     ]  # drop the step before the first frame
-    if found[0].shape[-1] == 4:
-        if not np.abs(np.linalg.norm(found[0], axis=-1) - 1).max() <= UNIT:
+    if outputs[0].shape[-1] == 4:
+        if not np.abs(np.linalg.norm(outputs[0], axis=-1) - 1).max() <= UNIT:
             return torch.full((len(clip),), torch.inf)
-        found[0] = quaternion_to_matrix(found[0].astype(np.float64))
-    apart = [np.abs(one - other).reshape(len(one), -1) for one, other in zip(found, expected, strict=True)]
+        outputs[0] = quaternion_to_matrix(outputs[0].astype(np.float64))
+    apart = [np.abs(one - other).reshape(len(one), -1) for one, other in zip(outputs, expected, strict=True)]
     return torch.from_numpy(np.concatenate(apart, 1).max(1))

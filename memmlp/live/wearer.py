@@ -73,8 +73,8 @@ def make_wearer(body: BodyTree, height: float | None = None, floor: float = 0.0)
         raise InputError(f"height={height}: must be {low:g} to {high:g} metres, or None")
     if not (_is_number(floor) and abs(floor) <= DEEPEST):
         raise InputError(f"floor={floor}: must be {-DEEPEST:g} to {DEEPEST:g} metres")
-    own = compute_body_height(body)
-    return Wearer(float(height or own), float(floor), own / height if height else 1.0)
+    network_height = compute_body_height(body)
+    return Wearer(float(height or network_height), float(floor), network_height / height if height else 1.0)
 
 
 def _is_number(value: object) -> bool:

@@ -142,7 +142,6 @@ def _has_resting_joint(clip: Clip) -> bool:
 
 
 def _spread_frames(clip: Clip, last: int | None = None) -> np.ndarray:
-    """Return the indices of up to SAMPLES frames, evenly spaced."""
     last = len(clip) if last is None else last
     return np.arange(last)[:: max(1, -(-last // SAMPLES))]
 

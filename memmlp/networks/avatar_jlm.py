@@ -91,16 +91,18 @@ class AvatarJLMGraph(StemGraph):
         first = h[:, -1:]
         for index, layer in enumerate(self.layers[:-1]):
             turned = h if index % 2 == 0 else h.transpose(0, 1)
-            made = apply_to_batch(layer, turned, turned)
-            h = self.model.restore_input_token(made if index % 2 == 0 else made.transpose(0, 1), first)
+            attended = apply_to_batch(layer, turned, turned)
+            h = self.model.restore_input_token(
+                attended if index % 2 == 0 else attended.transpose(0, 1), first
+            )
         by_token = h.transpose(0, 1)
         newest = apply_to_batch(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
         features = self.model.restore_input_token(newest, first[-1:]).flatten(1)
         return self.read(self.model.regressor(features), encoded)
 
-    def read(self, made: Tensor, encoded: Tensor) -> Tensor:
+    def read(self, outputs: Tensor, encoded: Tensor) -> Tensor:
         """Map the newest frame's outputs and inputs (1, 54) to its rotations (1, 132)."""
-        return made
+        return outputs
 
 
 @component("model", "avatar_jlm", version=2, builds="AvatarJLM")
@@ -236,8 +238,8 @@ class AvatarJLM(WindowModel):
         sparse, motion = true_frames[..., :SPARSE_DIM], true_frames[..., SPARSE_DIM:]
         origin = self.normalizer.find_origin(sparse)
         encoded = self.normalizer.encode_sparse(sparse, origin)
-        made, _ = self.place_coarse_joints(self.embedding(spread_over_joints(encoded)))
-        true = self.normalizer.coordinates.convert_motion_to_local(motion, origin)[..., POSITION]
-        joints = true.unflatten(-1, (N_JOINTS, 3))
-        error = made - (joints - joints[..., HEAD : HEAD + 1, :])
+        coarse_joints, _ = self.place_coarse_joints(self.embedding(spread_over_joints(encoded)))
+        true_positions = self.normalizer.coordinates.convert_motion_to_local(motion, origin)[..., POSITION]
+        joints = true_positions.unflatten(-1, (N_JOINTS, 3))
+        error = coarse_joints - (joints - joints[..., HEAD : HEAD + 1, :])
         return {"coarse": self.coarse_weight * error.abs().mean()}

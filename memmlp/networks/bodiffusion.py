@@ -37,7 +37,7 @@ class BoDiffusionGraph(StemGraph):
     computes only the newest frame.
     """
 
-    float32_modules = ("sparse", "motion", "made")
+    float32_modules = ("sparse", "motion", "output")
     model: BoDiffusion
     blocks: list[DiTBlock]
     modulations: Tensor
@@ -55,9 +55,9 @@ class BoDiffusionGraph(StemGraph):
         self.sparse = make_linear(sparse.flatten(1) @ mixture.T, model.stem.bias)
         head = model.head.weight.unflatten(0, (N_JOINTS, -1)).transpose(0, 1).flatten(1)
         offset = model.head.bias.unflatten(0, (N_JOINTS, -1))
-        made = (model.joint_head.weight @ head).unflatten(1, (N_JOINTS, -1)).unflatten(0, (2, NOISY))
+        weight = (model.joint_head.weight @ head).unflatten(1, (N_JOINTS, -1)).unflatten(0, (2, NOISY))
         bias = model.joint_head(offset).unflatten(1, (2, NOISY))
-        self.made = make_linear(made.transpose(1, 2).flatten(0, 2), bias.transpose(0, 1).flatten())
+        self.output = make_linear(weight.transpose(1, 2).flatten(0, 2), bias.transpose(0, 1).flatten())
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
         """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
@@ -77,9 +77,9 @@ class BoDiffusionGraph(StemGraph):
             *earlier, (block, modulation) = zip(self.blocks, self.modulations[index], strict=True)
             for one, its in earlier:
                 h = one.compute_newest(h, its.chunk(6), self.frames)
-            made = self.made(block.compute_newest(h, modulation.chunk(6), count))
-            made = DenoiserOutput(*made.split(ROTATION.stop, -1))
-            mean, variance = diffusion.step(noisy[-count:], made, index, limits)
+            outputs = self.output(block.compute_newest(h, modulation.chunk(6), count))
+            outputs = DenoiserOutput(*outputs.split(ROTATION.stop, -1))
+            mean, variance = diffusion.step(noisy[-count:], outputs, index, limits)
             return mean, variance.sqrt()
 
         return diffusion.sample(step, self.model.noises)
@@ -182,8 +182,8 @@ class BoDiffusion(WindowModel):
         h, embedding = self.stem(joints.flatten(-2)) + self.places, F.silu(self.time(time))
         for block in self.blocks:
             h = block(h, embedding)
-        made = self.joint_head(self.head(h).unflatten(-1, (N_JOINTS, -1)))
-        return DenoiserOutput(*(part.flatten(-2).to(noisy) for part in made.chunk(2, -1)))
+        outputs = self.joint_head(self.head(h).unflatten(-1, (N_JOINTS, -1)))
+        return DenoiserOutput(*(part.flatten(-2).to(noisy) for part in outputs.chunk(2, -1)))
 
     def step(self, noisy: Tensor, encoded: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Return mean and variance (B, T, 132) after a sampling step, given motion and inputs (B, T, 54)."""
@@ -233,8 +233,8 @@ class BoDiffusion(WindowModel):
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
         noisy, time, noise = self.diffusion.draw_noisy(clean)
-        made = self.denoise(noisy, time, encoded)
-        error, bound = self.diffusion.compute_losses(clean, noise, time, made, self.compute_limits())
-        found = self.diffusion.remove_noise(noisy, made.noise, time).clamp(*self.compute_limits())
+        predicted = self.denoise(noisy, time, encoded)
+        error, bound = self.diffusion.compute_losses(clean, noise, time, predicted, self.compute_limits())
+        rotations = self.diffusion.remove_noise(noisy, predicted.noise, time).clamp(*self.compute_limits())
         losses = {"noise": self.noise_weight * error, "bound": self.bound_weight * bound}
-        return TrainingOutputs(self.normalizer.decode_rotations(found, window), kept, losses)
+        return TrainingOutputs(self.normalizer.decode_rotations(rotations, window), kept, losses)

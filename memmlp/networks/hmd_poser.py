@@ -88,8 +88,8 @@ class TokenEmbedding(nn.Module):
 
     def forward(self, *parts: Tensor) -> Tensor:
         """Map the parts (..., n) to the token (..., d)."""
-        made = [layer(part) for layer, part in zip(self.parts, parts, strict=True)]
-        return F.leaky_relu(torch.cat(made, -1))
+        features = [layer(part) for layer, part in zip(self.parts, parts, strict=True)]
+        return F.leaky_relu(torch.cat(features, -1))
 
 
 class NormedLSTM(nn.Module):
@@ -114,11 +114,11 @@ class NormedLSTM(nn.Module):
         weights = [F.normalize(direction, dim=1) * gain for direction, gain in pairs]
         states = [state.contiguous()[None] for state in (hidden, cell)]
         with use_float32(x.device):  # not every CPU has an LSTM in bfloat16
-            made, *after = torch.lstm(
+            outputs, *after = torch.lstm(
                 x.float() if x.dtype == torch.bfloat16 else x,
                 states, [*weights, *self.biases], True, 1, 0.0, self.training, False, True,
             )  # fmt: skip
-        return made, after[0][0], after[1][0]
+        return outputs, after[0][0], after[1][0]
 
 
 class TimeAndTokenBlock(nn.Module):
@@ -136,9 +136,9 @@ class TimeAndTokenBlock(nn.Module):
     def forward(self, tokens: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map tokens (B, n, 8, d) and states (B, 8, d) to new tokens, and to states after the last frame."""
         each = [part.unbind(axis) for part, axis in ((tokens, 2), (hidden, 1), (cell, 1))]
-        made = [lstm(*of) for lstm, *of in zip(self.over_time, *each, strict=True)]
+        results = [lstm(*of) for lstm, *of in zip(self.over_time, *each, strict=True)]
         outputs, hidden, cell = (
-            torch.stack(of, axis) for of, axis in zip(zip(*made, strict=True), (2, 1, 1), strict=True)
+            torch.stack(of, axis) for of, axis in zip(zip(*results, strict=True), (2, 1, 1), strict=True)
         )
         h = outputs.flatten(0, 1).squeeze(0)  # without a batch axis, a live frame is exported to plain layers
         for layer in self.layers:
@@ -222,15 +222,15 @@ class HMDPoser(WindowlessModel):
         """Map world inputs (B, n, 54) to the tokens (B, n, 8, d)."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
         nothing = [encoded.new_zeros(*encoded.shape[:-1], OTHERS, size) for size in (6, 6, 3)]
-        found = []
+        tokens = []
         for layers, parts in (
             (self.trackers, split_by_feature(encoded)),
             (self.hands, locate_hands(sparse)),
             (self.others, nothing),
         ):
             each = zip(layers, *(part.unbind(-2) for part in parts), strict=True)
-            found += [layer(*own) for layer, *own in each]
-        return self.norm(torch.stack(found, -2))
+            tokens += [layer(*token_parts) for layer, *token_parts in each]
+        return self.norm(torch.stack(tokens, -2))
 
     def compute_features(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Map world inputs (B, n, 54) and the state to features (B, n, 8 d) and the new state."""
@@ -245,8 +245,8 @@ class HMDPoser(WindowlessModel):
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         features, kept = self.compute_features(sparse, state)
-        wanted = sparse.shape[1] if newest is None else newest
-        return self.normalizer.decode_rotations(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
+        count = sparse.shape[1] if newest is None else newest
+        return self.normalizer.decode_rotations(self.pose(features[:, -count:]), sparse[:, -count:]), kept
 
     def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the motion, and add the loss of the predicted shape; see MotionModel."""

@@ -139,8 +139,8 @@ def bend_middles(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> T
     along = dot(upper, axis) * dot(lower, axis)
     cosine, sine = dot(upper, lower) - along, dot(upper, cross(axis, lower))
     size = (cosine.square() + sine.square()).sqrt()
-    wanted = (reach.square() - dot(upper, upper) - dot(lower, lower)) / 2 - along
-    bend = (wanted / size).clamp(-1 + STRAIGHT_MARGIN, 1 - STRAIGHT_MARGIN)
+    needed_product = (reach.square() - dot(upper, upper) - dot(lower, lower)) / 2 - along
+    bend = (needed_product / size).clamp(-1 + STRAIGHT_MARGIN, 1 - STRAIGHT_MARGIN)
     across, cosine, sine = ((1 - bend) * (1 + bend)).sqrt(), cosine / size, sine / size
     axes = axis.expand(*bend.shape[:-1], 3)
     return make_axis_rotations(axes, cosine * bend - sine * across, sine * bend + cosine * across)
@@ -175,11 +175,11 @@ def limit_twist(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
     limit = (local.new_tensor(MAX_TWIST) * (math.pi / 360)).tan()[:, None]
     turned = dot(vector, bone)
     by_sine = real * dot(axis, bone) + dot(cross(axis, vector), bone)
-    found = []
+    tangents = []
     for bound in (limit, -limit):
         share = by_sine + bound * dot(axis, vector)
-        found.append((bound * real - turned) / torch.where(share.abs() < 1e-9, 1e-9, share))
-    nearest = torch.where(found[0].abs() < found[1].abs(), found[0], found[1])
+        tangents.append((bound * real - turned) / torch.where(share.abs() < 1e-9, 1e-9, share))
+    nearest = torch.where(tangents[0].abs() < tangents[1].abs(), tangents[0], tangents[1])
     half = torch.where(turned.abs() > limit * real, nearest, 0.0)
     size = 1 + half.square()
     return make_axis_rotations(axis, 2 / size - 1, 2 * half / size)

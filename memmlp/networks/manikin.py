@@ -177,7 +177,7 @@ class Manikin(MotionModel):
         """Map windows (B, T, 54) in network space to outputs (B, n, 86 or more) for their last n frames."""
         raise NotImplementedError
 
-    def compute_part_losses(self, outputs: Tensor, true: TrueParts) -> dict[str, Tensor]:
+    def compute_part_losses(self, outputs: Tensor, truth: TrueParts) -> dict[str, Tensor]:
         """Return the parts' losses for outputs (B, n, 86 or more), with the authors' weights."""
         raise NotImplementedError
 
@@ -205,17 +205,19 @@ class Manikin(MotionModel):
         motion = space.convert_motion_to_world(
             self.normalizer.decode_rotations(rotation, window[:, -count:]), heading
         )
-        true = torch.cat([window, space.convert_motion_to_local(true_frames[..., SPARSE_DIM:], heading)], -1)
-        return TrainingOutputs(motion, kept, self.compute_losses(outputs, true))
+        true_window = torch.cat(
+            [window, space.convert_motion_to_local(true_frames[..., SPARSE_DIM:], heading)], -1
+        )
+        return TrainingOutputs(motion, kept, self.compute_losses(outputs, true_window))
 
-    def compute_losses(self, outputs: Tensor, true: Tensor) -> dict[str, Tensor]:
+    def compute_losses(self, outputs: Tensor, true_frames: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of outputs (B, n, 86 or more), given true world frames (B, T, 252)."""
         motion = self.normalizer.coordinates.convert_motion_to_local(
-            true[..., SPARSE_DIM:], self.normalizer.find_origin(true[..., :SPARSE_DIM])
+            true_frames[..., SPARSE_DIM:], self.normalizer.find_origin(true_frames[..., :SPARSE_DIM])
         )
         with use_float32(outputs.device):
             parts = self.compute_part_losses(
-                outputs.to(true.dtype), TrueParts(motion[:, -outputs.shape[1] :])
+                outputs.to(true_frames.dtype), TrueParts(motion[:, -outputs.shape[1] :])
             )
         return {name: self.parts_weight * term for name, term in parts.items()}
 
@@ -275,7 +277,7 @@ class ManikinS(Manikin, AvatarPoser):
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.solve_pose(self.predict_parts(encoded), encoded[:, -1:])[:, 0]
 
-    def compute_part_losses(self, outputs: Tensor, true: TrueParts) -> dict[str, Tensor]:
+    def compute_part_losses(self, outputs: Tensor, truth: TrueParts) -> dict[str, Tensor]:
         """Return the parts' losses for outputs (B, 1, 86), with the authors' weights.
 
         Swivels are measured relative to the predicted shoulders and hips, without a gradient to them. That
@@ -284,18 +286,18 @@ class ManikinS(Manikin, AvatarPoser):
         """
         parts = PredictedParts.from_outputs(outputs, self.normalizer)
         _, turned, joints = parts.pose_body(self.normalizer.rest)
-        base, middle, end = true.list_limb_joints()
+        base, middle, end = truth.list_limb_joints()
         up, angle = turned[..., list(BASES), :, 1].detach(), F.normalize(parts.swivel, dim=-1)
         lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
-        rooted = (true.joints - true.joints[..., ROOT : ROOT + 1, :])[..., PLACED_JOINTS, :]
+        rooted = (truth.joints - truth.joints[..., ROOT : ROOT + 1, :])[..., PLACED_JOINTS, :]
         limbs = len(BASES)
         return {
-            "trunk_rotation": F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(PREDICTED_JOINTS), :]),
+            "trunk_rotation": F.l1_loss(parts.sixd[..., 1:, :], truth.sixd[..., list(PREDICTED_JOINTS), :]),
             "trunk_position": 5 * F.l1_loss(joints[..., PLACED_JOINTS, :], rooted),
             "swivel": 0.1 * 2 * limbs * F.l1_loss(parts.swivel, measure_swivels(base, middle, end, up)),
             "middle": limbs * F.l1_loss(place_middle(base, end, up, angle, *lengths), middle),
-            "ankle": 5 * F.l1_loss(parts.ankle, true.compute_vectors((HEAD,), ANKLES)),
-            "toe": 0.3 * F.l1_loss(parts.toe, true.compute_vectors(ANKLES, TOES)),
+            "ankle": 5 * F.l1_loss(parts.ankle, truth.compute_vectors((HEAD,), ANKLES)),
+            "toe": 0.3 * F.l1_loss(parts.toe, truth.compute_vectors(ANKLES, TOES)),
         }
 
 
@@ -350,11 +352,11 @@ class ManikinL(Manikin, AvatarJLM):
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.solve_pose(self.predict_parts(encoded), encoded)
 
-    def compute_losses(self, outputs: Tensor, true: Tensor) -> dict[str, Tensor]:
+    def compute_losses(self, outputs: Tensor, true_frames: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of the parts and of the coarse pose; see Manikin."""
-        return super().compute_losses(outputs, true) | self.compute_coarse_loss(true)
+        return super().compute_losses(outputs, true_frames) | self.compute_coarse_loss(true_frames)
 
-    def compute_part_losses(self, outputs: Tensor, true: TrueParts) -> dict[str, Tensor]:
+    def compute_part_losses(self, outputs: Tensor, truth: TrueParts) -> dict[str, Tensor]:
         """Return the parts' losses for outputs (B, T, 212), with the authors' weights.
 
         Swivels are compared as angles relative to the true shoulders and hips. Toes are compared with the
@@ -362,16 +364,16 @@ class ManikinL(Manikin, AvatarJLM):
         """
         parts = PredictedParts.from_outputs(outputs, self.normalizer)
         turned, _ = forward_kinematics(
-            sixd_to_matrix(true.sixd), torch.zeros_like(true.joints[..., ROOT, :]), self.normalizer.rest
+            sixd_to_matrix(truth.sixd), torch.zeros_like(truth.joints[..., ROOT, :]), self.normalizer.rest
         )
-        wanted = measure_swivels(*true.list_limb_joints(), turned[..., list(BASES), :, 1])
-        (x, y), (cosine, sine) = parts.swivel.unbind(-1), wanted.unbind(-1)
-        toe = true.compute_vectors((HEAD,), TOES)
+        true_swivels = measure_swivels(*truth.list_limb_joints(), turned[..., list(BASES), :, 1])
+        (x, y), (cosine, sine) = parts.swivel.unbind(-1), true_swivels.unbind(-1)
+        toe = truth.compute_vectors((HEAD,), TOES)
         return {
             "trunk_rotation": 2
-            * F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(PREDICTED_JOINTS), :]),
+            * F.l1_loss(parts.sixd[..., 1:, :], truth.sixd[..., list(PREDICTED_JOINTS), :]),
             "swivel": 0.1 * torch.atan2(y * cosine - x * sine, x * cosine + y * sine).abs().mean(),
-            "ankle": 5 * F.l1_loss(parts.ankle, true.compute_vectors((HEAD,), ANKLES)),
+            "ankle": 5 * F.l1_loss(parts.ankle, truth.compute_vectors((HEAD,), ANKLES)),
             "toe": 5 * F.l1_loss(parts.ankle + parts.toe, toe),
-            "auxiliary": 2 * F.l1_loss(outputs[..., PREDICTED_SIZE:], true.sixd[..., 1:, :].flatten(-2)),
+            "auxiliary": 2 * F.l1_loss(outputs[..., PREDICTED_SIZE:], truth.sixd[..., 1:, :].flatten(-2)),
         }

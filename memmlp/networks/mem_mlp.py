@@ -71,13 +71,13 @@ class StreamingBlock(nn.Module):
 
         mix = self.time_mix
         h = take(h) + F.silu(torch.addmm(take(mix.bias), take(mix.weight), self.time_norm(h)))
-        made = self.linear(self.norm(h))
+        linear = self.linear(self.norm(h))
         if self.index is None:
-            return h + F.silu(made)
+            return h + F.silu(linear)
         contribution = take(contributions[self.index])
         if self.plain:
-            return self.merge(h + F.silu(made)) + contribution
-        return h + F.silu(made + contribution)
+            return self.merge(h + F.silu(linear)) + contribution
+        return h + F.silu(linear + contribution)
 
 
 class StreamingBranch(nn.Module):
@@ -119,10 +119,10 @@ class MemMLPGraph(StreamingGraph):
         def convert(block: Any) -> StreamingBlock:
             if not isinstance(block, MemoryBlock):
                 return StreamingBlock(block)
-            made = StreamingBlock(block.fusion, len(parts))
+            streaming_block = StreamingBlock(block.fusion, len(parts))
             features.append(block.feature)
-            parts.append(made.feature_part)
-            return made
+            parts.append(streaming_block.feature_part)
+            return streaming_block
 
         self.blocks = nn.ModuleList(map(convert, model.blocks))
         self.predictor = model.predictor
@@ -295,11 +295,11 @@ class MemMLP(MotionModel):
         h = self.stem(encoded[:, -self.frames :])
         for block in self.blocks:
             h = block(h, past)
-        wanted = self.frames if newest is None else newest
-        made = max(wanted, self.memory.count_needed(new))
-        motion = self.predictor(h, past, inputs[:, -self.frames :], self.normalizer, made)
+        count = self.frames if newest is None else newest
+        computed_count = max(count, self.memory.count_needed(new))
+        motion = self.predictor(h, past, inputs[:, -self.frames :], self.normalizer, computed_count)
         kept |= self.memory.remember(motion, past, state, new)
-        return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
+        return self.normalizer.decode_motion(motion[:, -count:], origin[:, -count:]), kept
 
     def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Predict the motion; a jointly trained VQ-VAE adds its losses."""

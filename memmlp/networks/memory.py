@@ -97,8 +97,8 @@ class Recall(nn.Module):
         if not self.parts:
             return (), ()
         z = self.compute_features(past)
-        before, made = self.compute_features_before_start(z), self._compute_contributions(z)
-        return made, made if before is z else self._compute_contributions(before)
+        before, contributions = self.compute_features_before_start(z), self._compute_contributions(z)
+        return contributions, contributions if before is z else self._compute_contributions(before)
 
     def compute_features(self, past: Any) -> Tensor:
         """Return the features (1, blocks, k) of the new frame."""

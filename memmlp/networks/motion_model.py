@@ -190,8 +190,8 @@ class WindowModel(MotionModel):
         rotation = self.predict_rotations(
             self.normalizer.encode_sparse(window, self.normalizer.find_origin(window))
         )
-        wanted = self.frames if newest is None else newest
-        return self.normalizer.decode_rotations(rotation[:, -wanted:], window[:, -wanted:]), kept
+        count = self.frames if newest is None else newest
+        return self.normalizer.decode_rotations(rotation[:, -count:], window[:, -count:]), kept
 
 
 class NewestFrameModel(MotionModel):
@@ -210,13 +210,13 @@ class NewestFrameModel(MotionModel):
         By default the n new frames are returned, which is the maximum for this network.
         """
         inputs, kept = self.append_inputs(sparse, state)
-        wanted = sparse.shape[1] if newest is None else newest
-        ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)
+        count = sparse.shape[1] if newest is None else newest
+        ends = torch.arange(inputs.shape[1] - count, inputs.shape[1], device=inputs.device)
         window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)
         encoded = self.normalizer.encode_sparse(inputs, self.normalizer.find_origin(inputs))
         windows = torch.unflatten(encoded.index_select(1, window.flatten()), 1, window.shape)
-        rotation = torch.unflatten(self.predict_rotations(windows.flatten(0, 1)), 0, (len(inputs), wanted))
-        return self.normalizer.decode_rotations(rotation, inputs[:, -wanted:]), kept
+        rotation = torch.unflatten(self.predict_rotations(windows.flatten(0, 1)), 0, (len(inputs), count))
+        return self.normalizer.decode_rotations(rotation, inputs[:, -count:]), kept
 
 
 def fill_past(earlier: Tensor, first: Tensor, is_first_step: Tensor) -> Tensor:

@@ -64,8 +64,8 @@ class GRUCell(RecurrentCell):
         self.layer = nn.GRU(width, width, batch_first=True)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        made, after = self.layer(x, state[None].contiguous())
-        return made, after[0]
+        outputs, after = self.layer(x, state[None].contiguous())
+        return outputs, after[0]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         state = step_gru(self.layer.all_weights[0], x, state)
@@ -83,8 +83,8 @@ class LSTMCell(RecurrentCell):
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         hidden, cell = (part[None].contiguous() for part in state.chunk(2, -1))
-        made, after = self.layer(x, (hidden, cell))
-        return made, torch.cat(after, -1)[0]
+        outputs, after = self.layer(x, (hidden, cell))
+        return outputs, torch.cat(after, -1)[0]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         hidden, cell = state.chunk(2, -1)
@@ -188,11 +188,11 @@ class RecurrentBlock(nn.Module):
         """Map a sequence (B, n, d) or frame (B, d) to the same shape; return it and the new state."""
         x = self.cell_norm(h)
         if h.dim() == 2:
-            made, state = self.cell.step(x, state)
+            outputs, state = self.cell.step(x, state)
         else:
             with use_float32(h.device):  # a state adds up what bfloat16 rounds
-                made, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
-        h = h + made
+                outputs, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
+        h = h + outputs
         return h + self.mlp(self.norm(h)), state
 
 
@@ -256,8 +256,8 @@ class RecurrentPoserGraph(FrameGraph):
         self.float32_modules = tuple(float32)
 
     def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
-        made, kept = self.model.predict_members(sparse, state)
-        return self.model.pose(made.mean(0), sparse), kept
+        rotations, kept = self.model.predict_members(sparse, state)
+        return self.model.pose(rotations.mean(0), sparse), kept
 
 
 @component("model", "recurrent_poser", version=3, builds="RecurrentPoser")
@@ -360,19 +360,19 @@ class RecurrentPoser(WindowlessModel):
             state: the state before these frames.
         """
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
-        made: list[Tensor] = []
+        members: list[Tensor] = []
         kept: State = {}
         for name, member in self.members.items():
-            own = {key.removeprefix(f"{name}_"): value for key, value in state.items()}
-            rotations, after = member(encoded, own)
-            made.append(rotations)
+            member_state = {key.removeprefix(f"{name}_"): value for key, value in state.items()}
+            rotations, after = member(encoded, member_state)
+            members.append(rotations)
             kept |= {f"{name}_{block}": value for block, value in after.items()}
-        return torch.stack(made), kept
+        return torch.stack(members), kept
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        made, kept = self.predict_members(sparse, state)
+        rotations, kept = self.predict_members(sparse, state)
         start = sparse.shape[1] - (sparse.shape[1] if newest is None else newest)
-        return self.pose(made[:, :, start:].mean(0), sparse[:, start:]), kept
+        return self.pose(rotations[:, :, start:].mean(0), sparse[:, start:]), kept
 
     def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Return each member's motion, one after the other (members x B, T, 198); see MotionModel.
@@ -380,6 +380,6 @@ class RecurrentPoser(WindowlessModel):
         The arms do not reach for the trackers here. Losses after reaching gave larger errors of rotations and
         positions.
         """
-        made, kept = self.predict_members(sparse, state)
-        motion = self.pose(made, sparse.expand(len(made), -1, -1, -1), reach=False)
+        rotations, kept = self.predict_members(sparse, state)
+        motion = self.pose(rotations, sparse.expand(len(rotations), -1, -1, -1), reach=False)
         return TrainingOutputs(motion.flatten(0, 1), kept, {})

@@ -129,13 +129,13 @@ class RefinedModel(MotionModel):
 
         By default the n new frames are returned, which is the maximum for this network.
         """
-        made, kept = [], {name: tensor for name, tensor in state.items() if name != HIDDEN}
+        motions, kept = [], {name: tensor for name, tensor in state.items() if name != HIDDEN}
         for frame in sparse.split(1, 1):
             motion, kept = self.network.advance(frame, kept, 1)
-            made.append(motion)
-        refined, hidden = self.refine(torch.cat(made, 1), sparse, state[HIDDEN])
-        wanted = sparse.shape[1] if newest is None else newest
-        return refined[:, -wanted:], {**kept, HIDDEN: hidden}
+            motions.append(motion)
+        refined, hidden = self.refine(torch.cat(motions, 1), sparse, state[HIDDEN])
+        count = sparse.shape[1] if newest is None else newest
+        return refined[:, -count:], {**kept, HIDDEN: hidden}
 
     def refine(self, motion: Tensor, sparse: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Correct the motion of consecutive frames.

@@ -140,16 +140,16 @@ class RPM(WindowlessModel):
         Returns:
             The prediction (B, W, 132) from that frame on, in network space, and the new state.
         """
-        before = torch.where(state["started"][..., None] > 0, state["sparse"], encoded)
-        inputs = torch.cat([before, encoded], 1)
-        made = self.predict(state["motion"], inputs)
-        known = torch.cat([state["prediction"][:, 1:], made[:, -1:]], 1)
-        known = torch.where(state["predicted"][..., None] > 0, known, made)
-        made = known + self.freedom * (made - known).tanh()
-        return made, {
+        previous_inputs = torch.where(state["started"][..., None] > 0, state["sparse"], encoded)
+        inputs = torch.cat([previous_inputs, encoded], 1)
+        prediction = self.predict(state["motion"], inputs)
+        earlier = torch.cat([state["prediction"][:, 1:], prediction[:, -1:]], 1)
+        earlier = torch.where(state["predicted"][..., None] > 0, earlier, prediction)
+        prediction = earlier + self.freedom * (prediction - earlier).tanh()
+        return prediction, {
             "sparse": inputs[:, 1:],
-            "motion": torch.cat([state["motion"], made[:, :1]], 1)[:, 1:],
-            "prediction": made,
+            "motion": torch.cat([state["motion"], prediction[:, :1]], 1)[:, 1:],
+            "prediction": prediction,
             "started": torch.ones_like(state["started"]),
             "predicted": torch.ones_like(state["predicted"]),
         }
@@ -159,12 +159,12 @@ class RPM(WindowlessModel):
         return self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        shown = []
+        frames = []
         for frame in self.encode(sparse).split(1, 1):
-            made, state = self.step_frame(frame, state)
-            shown.append(made[:, :1])
-        wanted = sparse.shape[1] if newest is None else newest
-        return self.normalizer.decode_rotations(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
+            prediction, state = self.step_frame(frame, state)
+            frames.append(prediction[:, :1])
+        count = sparse.shape[1] if newest is None else newest
+        return self.normalizer.decode_rotations(torch.cat(frames[-count:], 1), sparse[:, -count:]), state
 
     def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Run over a few frames without gradients, then predict with gradients; see MotionModel.
@@ -177,11 +177,11 @@ class RPM(WindowlessModel):
         past = slice(begin - self.context, begin)
         motion = self.normalizer.encode(true_frames[:, past])[..., SPARSE_DIM:][..., ROTATION]
         drawn = distributed.draw_rows(torch.rand_like, true_frames[:, past][:, :1, 0])
-        known = (drawn >= FRESH_FRACTION).to(true_frames.dtype)  # the other windows start without a past
+        has_past = (drawn >= FRESH_FRACTION).to(true_frames.dtype)  # the other windows start without a past
         state = state | {
-            "sparse": known[..., None] * encoded[:, past],
-            "motion": known[..., None] * motion,
-            "started": known,
+            "sparse": has_past[..., None] * encoded[:, past],
+            "motion": has_past[..., None] * motion,
+            "started": has_past,
         }
         training = self.training
         self.train(training and self.own_dropout)
@@ -190,5 +190,5 @@ class RPM(WindowlessModel):
                 _, state = self.step_frame(encoded[:, index : index + 1], state)
         self.train(training)
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
-        made, state = self.step_frame(encoded[:, now : now + 1], state)
-        return TrainingOutputs(self.normalizer.decode_rotations(made, sparse[:, now:]), state, {})
+        prediction, state = self.step_frame(encoded[:, now : now + 1], state)
+        return TrainingOutputs(self.normalizer.decode_rotations(prediction, sparse[:, now:]), state, {})

@@ -47,8 +47,8 @@ class DenoiserAtSamplingTimes(nn.Module):
         weight = denoiser.stem.weight
         embedding = F.silu(denoiser.time(torch.tensor(times).to(weight)))
         self.blocks = cast(list[DiTBlock], denoiser.blocks)
-        made = torch.stack([block.modulation(embedding) for block in self.blocks], 1)
-        self.register_buffer("modulations", made)
+        modulations = torch.stack([block.modulation(embedding) for block in self.blocks], 1)
+        self.register_buffer("modulations", modulations)
         seen, noisy = weight.split([weight.shape[1] - LATENT, LATENT], 1)
         self.denoiser, self.seen, self.noisy = (
             denoiser,

@@ -238,8 +238,8 @@ class HalfVQVAE(nn.Module):
             rotation: rotations (B, T, 132) of all joints; only this half's joints are used.
             encoded: inputs (B, T, 54).
         """
-        own = rotation.unflatten(-1, (N_JOINTS, 6))[..., list(self.joints), :]
-        h = self.stem(torch.cat([own, self.mixture(encoded)], -1).flatten(-2))
+        half = rotation.unflatten(-1, (N_JOINTS, 6))[..., list(self.joints), :]
+        h = self.stem(torch.cat([half, self.mixture(encoded)], -1).flatten(-2))
         return self.quantiser(self.into(self.encoder(h)))
 
     def decode(self, latent: Tensor) -> Tensor:

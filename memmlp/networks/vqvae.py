@@ -212,5 +212,4 @@ def measure_rotation_error(rotations: Tensor, frames: Tensor, normalizer: Normal
 
 
 def _make_blocks(width: int, depth: int) -> list[nn.Module]:
-    """Make `depth` blocks of LayerNorm, Linear and SiLU (App. A)."""
     return [nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU()) for _ in range(depth)]

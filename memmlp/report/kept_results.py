@@ -245,7 +245,6 @@ def _round_numbers(values: Iterable[float]) -> list[float | str | None]:
 
 
 def _parse_record(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> MeasuredRun:
-    """Return a run from its record in the file."""
     names, errors = [clip for clip, *_ in clips], record["errors"]
     by_clip: dict[str, Errors] = {name: {mode: {} for mode in errors} for name in names}
     for mode, branches in errors.items():

@@ -250,15 +250,15 @@ class Placeholders:
                 raise InputError(f"{name}: decided must have no patterns; these clips cannot be regrouped")
             table = regroup(patterns)
         cells = (cell for row in table.rows for metrics in row.cells.values() for cell in metrics.values())
-        found = Counter(cell.effect.verdict for cell in cells if cell.effect and cell.effect.verdict)
-        return f"{found.total() - found[Verdict.INCONCLUSIVE] - found[Verdict.EQUIVALENT]} of {found.total()}"
+        counts = Counter(cell.effect.verdict for cell in cells if cell.effect and cell.effect.verdict)
+        significant = counts.total() - counts[Verdict.INCONCLUSIVE] - counts[Verdict.EQUIVALENT]
+        return f"{significant} of {counts.total()}"
 
     def _find_table(self, name: str) -> Table:
         _check_name("results", name, self.sources)
         return self.sources[name].table
 
     def _find_cell(self, name: str, variant: str, mode: str, metric: str) -> Cell:
-        """Return a table's cell. Raises InputError for an unknown name."""
         rows = {row.label: row for row in self._find_table(name).rows}
         _check_name(f"variant of {name}", variant, rows)
         _check_name("mode", mode, rows[variant].cells)

@@ -96,7 +96,6 @@ def import_run(
 
 
 def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> tuple[str, list[str]]:
-    """Check names and sizes, and return the run's id and the names of its files."""
     every = archive.namelist()
     run_id = every[0].partition("/")[0] if every else ""
     if len(every) > MAX_FILES or len(set(every)) != len(every) or not ID.fullmatch(run_id):

@@ -267,9 +267,9 @@ def list_prerequisite_origins(manifest: Mapping[str, Any], weights: str | None) 
         manifest: the manifest of the direct prerequisite run.
         weights: the SHA-256 of its weights.
     """
-    own = {"id": manifest.get("id"), "kind": manifest.get("kind"), "weights": weights}
+    origin = {"id": manifest.get("id"), "kind": manifest.get("kind"), "weights": weights}
     facts = {name: manifest[name] for name in FACTS if name in manifest}
-    return [own | facts, *get_recorded_prerequisites(manifest)]
+    return [origin | facts, *get_recorded_prerequisites(manifest)]
 
 
 def get_recorded_prerequisites(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -191,7 +191,6 @@ class ConfiguredEvaluations:
         return {str(mode): changed for mode, changed in last.items() if changed}
 
     def _read_reports(self) -> list[dict[str, Any]]:
-        """Return the reports. Raises InputError if a report is damaged."""
         for path, report in self._matching.items():
             check_report(path, report)
         return list(self._matching.values())

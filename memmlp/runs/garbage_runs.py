@@ -95,7 +95,6 @@ def _find_orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
 
 
 def _list_plans(outputs: Path) -> Iterator[Path]:
-    """Yield the plan files of sweeps, and of searches in progress."""
     yield from outputs.glob("sweeps/*/plan.json")
     for path in outputs.glob("*/*/controllers/*.process"):
         if (process := read_json(path)) and is_alive(process) is not False:
@@ -108,7 +107,6 @@ def _read_entries(path: Path, key: str) -> Iterator[Mapping[str, Any]]:
 
 
 def _has_notes(run: Run) -> bool:
-    """Return whether the run has a tag or a note."""
     notes = read_notes(run)
     return bool(notes.tags or notes.note)
 

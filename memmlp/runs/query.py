@@ -185,8 +185,6 @@ def parse_query(text: str) -> Query:
 
 
 class _Tokens:
-    """Reads the tokens of a condition one by one."""
-
     def __init__(self, text: str):
         self.text, self.rest = text, text.strip()
         self.keys: list[str] = []

@@ -182,12 +182,12 @@ class Sweep:
         Raises:
             InputError: for an unknown label, or a row with only the paper's values.
         """
-        known = [variant.label for variant in self.list_runnable()]
-        if missing := [name for name in names if name not in known]:
+        labels = [variant.label for variant in self.list_runnable()]
+        if missing := [name for name in names if name not in labels]:
             raise InputError(
-                f"sweep {self.name}: no variant '{missing[0]}' can be run; expected {', '.join(known)}"
+                f"sweep {self.name}: no variant '{missing[0]}' can be run; expected {', '.join(labels)}"
             )
-        return tuple(names) or tuple(known)
+        return tuple(names) or tuple(labels)
 
     def list_variant_seeds(self) -> list[VariantSeed]:
         """Return each variant with each of its seeds, ordered by variant."""

@@ -84,13 +84,13 @@ class Plan:
         """Return a plan with only the variants with these labels, and the tasks that they need."""
         chosen = set(labels)
         entries = tuple(entry for entry in self.entries if entry.label in chosen)
-        wanted = {entry.key for entry in entries}
+        keys = {entry.key for entry in entries}
         for task in reversed(
             self.tasks
         ):  # backwards: a task comes after its prerequisite; a prerequisite's key is its id
-            if task.key in wanted and task.prerequisite:
-                wanted.add(task.prerequisite)
-        return replace(self, entries=entries, tasks=tuple(task for task in self.tasks if task.key in wanted))
+            if task.key in keys and task.prerequisite:
+                keys.add(task.prerequisite)
+        return replace(self, entries=entries, tasks=tuple(task for task in self.tasks if task.key in keys))
 
     def run(self, label: str, seed: int) -> Run | None:
         """Return the run of a variant with a seed; None if the plan does not have it."""
@@ -116,13 +116,13 @@ class Plan:
         Args:
             before: earlier states. Tasks that were done then are not read again.
         """
-        known = {key for key, state in (before or {}).items() if state == "done"}
-        found = {}
+        done = {key for key, state in (before or {}).items() if state == "done"}
+        states = {}
         for task in self.tasks:
-            found[task.key] = (
-                "done" if task.key in known else self.get_run(task).state(self.is_complete(task))
+            states[task.key] = (
+                "done" if task.key in done else self.get_run(task).state(self.is_complete(task))
             )
-        return self.mark_blocked(found)
+        return self.mark_blocked(states)
 
     def mark_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
         """Return the states, with "blocked" for each task after a failed prerequisite."""

@@ -45,9 +45,9 @@ def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
     memmlp("results", "save", "14")
     ran = memmlp("results", "show", "table14", "--together", "(salsa)")
     assert ran.code == 0
-    assert "3 groups of test clips in place of 4" in " ".join(ran.out.split())
+    assert "merged 4 groups of test clips into 3" in " ".join(ran.out.split())
     kept = memmlp("results", "show", "table14").out
-    assert "in place of" not in kept
+    assert "merged" not in kept
     assert kept.splitlines()[2:20] == memmlp("table", "14").out.splitlines()[2:20]
 
 

@@ -48,7 +48,7 @@ def test_command_shows_another_branch(memmlp: Memmlp, planned: None):
 
 def test_command_puts_clips_together(memmlp: Memmlp, planned: None):
     out = " ".join(memmlp("table", "14", "--together", "(salsa)").out.split())
-    assert "3 groups of test clips in place of 4" in out
+    assert "merged 4 groups of test clips into 3" in out
     assert one_line(
         memmlp("table", "14", "--together", "walk"), "--together walk: must match clips in different groups"
     )

@@ -77,8 +77,8 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
         hint = "memmlp demo creates one; --outputs FOLDER or MEMMLP_OUTPUTS selects another folder"
         click.echo(f"no runs in {outputs.absolute() / 'runs'}: {hint}")
         return
-    found = runs if every or query else [run for run in runs if not _is_finished_part(run)]
-    newest = found if every or query or sort else found[:MAX_RUNS]
+    chosen = runs if every or query else [run for run in runs if not _is_finished_part(run)]
+    newest = chosen if every or query or sort else chosen[:MAX_RUNS]
     records = {run.id: read_record(run) for run in newest}
     fits = query.match_records(list(records.values())) if query else [True] * len(records)
     listed = [run for run, fit in zip(newest, fits, strict=True) if fit]
@@ -93,24 +93,24 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
         more = f" and {len(hidden) - MAX_NAMED_KEYS} more keys" if len(hidden) > MAX_NAMED_KEYS else ""
         option = ",".join(["name", *hidden[:MAX_NAMED_KEYS], "stream.MPJPE"])
         click.echo(f"they also differ in {', '.join(hidden[:MAX_NAMED_KEYS])}{more}: --columns {option}")
-    if parts := Counter(describe_kind(run.manifest["kind"]) for run in runs if run not in found):
+    if parts := Counter(describe_kind(run.manifest["kind"]) for run in runs if run not in chosen):
         counts = ", ".join(f"{count} finished {word}" for word, count in parts.items())
         click.echo(f"{counts}: memmlp runs list --all")
-    if len(found) > len(newest):
-        click.echo(f"{len(found) - len(newest)} older runs: memmlp runs list --all")
+    if len(chosen) > len(newest):
+        click.echo(f"{len(chosen) - len(newest)} older runs: memmlp runs list --all")
     elif query:
-        click.echo(f"{len(listed)} of {len(found)} runs")
+        click.echo(f"{len(listed)} of {len(chosen)} runs")
 
 
 def _describe_outdated_results(listed: Sequence[Run]) -> list[str]:
     """Return a line for each mode with results of an earlier component version."""
-    found: dict[tuple[str, str], list[str]] = {}
+    ids_by_change: dict[tuple[str, str], list[str]] = {}
     for run in listed:
         for results in list_outdated_results(run).items():
-            found.setdefault(results, []).append(run.id[:ID_LENGTH])
+            ids_by_change.setdefault(results, []).append(run.id[:ID_LENGTH])
     return [
         f"{results} {by}; measure again with memmlp eval RUN: {_join_ids(ids)}"
-        for (results, by), ids in found.items()
+        for (results, by), ids in ids_by_change.items()
     ]
 
 
@@ -143,10 +143,12 @@ def _sort_runs(listed: Sequence[Run], records: Mapping[str, Record], sort: str) 
     key, reverse = sort.removeprefix("-"), sort.startswith("-")
     check_key(key, records.values(), "--sort")
     values: dict[str, Any] = {run.id: records[run.id].get(key) for run in listed}
-    known = [run for run in listed if values[run.id] not in (None, "", ()) and not _is_nan(values[run.id])]
-    numbers = all(isinstance(values[run.id], int | float) for run in known)
-    known.sort(key=lambda run: values[run.id] if numbers else str(values[run.id]), reverse=reverse)
-    return [*known, *(run for run in listed if run not in known)]
+    with_value = [
+        run for run in listed if values[run.id] not in (None, "", ()) and not _is_nan(values[run.id])
+    ]
+    numbers = all(isinstance(values[run.id], int | float) for run in with_value)
+    with_value.sort(key=lambda run: values[run.id] if numbers else str(values[run.id]), reverse=reverse)
+    return [*with_value, *(run for run in listed if run not in with_value)]
 
 
 def _is_nan(value: object) -> bool:
@@ -189,7 +191,6 @@ def _print_table(records: Sequence[Record], keys: Sequence[str], keys_requested:
 def _make_columns(
     records: Sequence[Record], keys: Sequence[str], keys_requested: bool
 ) -> dict[str, list[str]]:
-    """Return the cells of all columns by header."""
     from memmlp.runs.query import label_data
 
     columns = {"run": [one["id"] for one in records]}
@@ -212,7 +213,6 @@ def _make_columns(
 
 
 def _make_table(columns: Mapping[str, Sequence[str]], keys_requested: bool) -> Table:
-    """Make a table of columns in which only names wrap."""
     table = make_plain_table()
     table.padding, table.show_edge = (0, 0), False
     table.caption_justify, table.caption_style = "left", ""

@@ -64,7 +64,6 @@ def show(run: str, config: bool, outputs: Path) -> None:
 
 
 def _summarize_run(run: Run) -> dict[str, Any]:
-    """Return the facts about a run and its progress."""
     values, manifest = read_record(run), run.manifest
     facts = {"run": run.id, "name": values.get("name"), "folder": run.folder, "status": run.status}
     if failure := run.failure:
@@ -232,7 +231,6 @@ def make_plain_table(*columns: str, title: str | None = None) -> Table:
 
 
 def _make_pair_table(facts: Mapping[str, Any], title: str | None = None) -> Table:
-    """Make a table of keys and values."""
     table = make_plain_table("", "", title=title)
     table.show_header = False
     for key, value in facts.items():

@@ -63,21 +63,21 @@ def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
     """
     from memmlp.runs.garbage_runs import REASONS, delete, find_garbage
 
-    found = find_garbage(outputs, kinds or REASONS)
-    if not found:
+    garbage = find_garbage(outputs, kinds or REASONS)
+    if not garbage:
         click.echo("nothing to delete")
         return
     table = make_plain_table("run", "kind", "reason", "age", "MB")
-    for one in found:
+    for one in garbage:
         table.add_row(one.run.id, one.kind, one.reason, format_age(one.run), f"{one.size / 1e6:.1f}")
     make_console().print(table)
     if not yes:
-        size = sum(one.size for one in found) / 1e6
-        click.echo(f"{len(found)} runs, {size:.1f} MB; delete them with --yes")
+        size = sum(one.size for one in garbage) / 1e6
+        click.echo(f"{len(garbage)} runs, {size:.1f} MB; delete them with --yes")
         return
-    deleted = [one for one in found if delete(one)]
+    deleted = [one for one in garbage if delete(one)]
     click.echo(f"deleted {len(deleted)} runs, {sum(one.size for one in deleted) / 1e6:.1f} MB")
-    for one in found:
+    for one in garbage:
         if one not in deleted:
             click.echo(f"run {one.run.id} is not deleted: it is in use, or has a tag or a note", err=True)
 

@@ -239,7 +239,6 @@ class Fitting:
             self._execute(command, trackers)
 
     def _execute(self, command: PageCommand, trackers: QuaternionPoses | None) -> None:
-        """Execute a command, save the calibration, and publish the result."""
         try:
             line = self._adjust_stream(command, trackers)
             if self.path is not None and command.action != "cancel":
@@ -252,7 +251,6 @@ class Fitting:
             self._publish_state(line)
 
     def _adjust_stream(self, command: PageCommand, trackers: QuaternionPoses | None) -> str:
-        """Change the stream, and return a line about the result."""
         stream, value = self.stream, command.value
         if command.action == "calibrate" and trackers:
             offsets = stream.calibrate(*trackers)

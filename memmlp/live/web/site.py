@@ -233,8 +233,8 @@ def _write_page(folder: Path) -> None:
 
     The version of the worker changes if any file changes.
     """
-    own = resources.files("memmlp.live.web").joinpath("page")
-    for package, names in {"memmlp.live.web": [path.name for path in own.iterdir()], **OTHER_PAGES}.items():
+    page = resources.files("memmlp.live.web").joinpath("page")
+    for package, names in {"memmlp.live.web": [path.name for path in page.iterdir()], **OTHER_PAGES}.items():
         for name in names:
             _write_file(folder, name, read_page_file(package, name))
     index = (folder / "index.html").read_text("utf-8")

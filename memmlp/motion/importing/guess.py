@@ -117,8 +117,6 @@ def guess_map(recording: Recording, name: str) -> MapGuess:
 
 
 class _Tree:
-    """The nodes of a recording, and the parts of their names."""
-
     def __init__(self, recording: Recording) -> None:
         self.parents, self.nodes = recording.node_parents, recording.nodes
         self.words = [split_node_name(name) for name in strip_namespace(recording.nodes)]

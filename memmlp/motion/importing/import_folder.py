@@ -180,8 +180,6 @@ def verify_folder(source: Path, settings: ImportSettings | None = None) -> Itera
 
 @dataclass(frozen=True)
 class _ConvertedFile:
-    """A converted recording, with its map and its rate."""
-
     recording: Recording
     skeleton: SkeletonMap
     rate: Rate
@@ -274,7 +272,6 @@ def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, 
 
 
 def _write_notes(clips: Sequence[ImportedClip], settings: ImportSettings) -> Iterator[str]:
-    """Yield notes for the user, one line each."""
     corrected: dict[str, list[str]] = {}
     for clip in clips:
         if clip.header_fps not in (None, clip.fps):
@@ -307,5 +304,4 @@ def _write_notes(clips: Sequence[ImportedClip], settings: ImportSettings) -> Ite
 
 
 def _format_names(names: Sequence[str], count: int) -> str:
-    """List the first names, and count the others."""
     return ", ".join(names[:count]) + (f" and {len(names) - count} more" if len(names) > count else "")

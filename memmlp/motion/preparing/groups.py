@@ -167,13 +167,15 @@ def describe_divided_folders(manifest: Manifest) -> str:
         for name in names:
             clip = records[prefix + name]
             if clip.group == clip.name and not _matches_pattern(split, name):
-                own, *above = _list_folders(name)
+                inner, *above = _list_folders(name)
                 # If each take has its own folder, the parent folder is the person's.
-                parts[next((folder for folder in (own, *above) if held[folder] > 1), own)].append(clip.split)
+                parts[next((folder for folder in (inner, *above) if held[folder] > 1), inner)].append(
+                    clip.split
+                )
         folders += [
-            (prefix + folder, found.count("test"))
-            for folder, found in parts.items()
-            if held[folder] < len(names) and {"train", "test"} <= set(found)
+            (prefix + folder, splits.count("test"))
+            for folder, splits in parts.items()
+            if held[folder] < len(names) and {"train", "test"} <= set(splits)
         ]
     if not folders:
         return ""

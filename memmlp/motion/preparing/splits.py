@@ -408,7 +408,6 @@ def _check_one_release(matches: Iterable[Sequence[str]]) -> None:
 
 
 def _read_lists(folder: Path) -> dict[str, str]:
-    """Read all lists below a folder, and map clip names to "train" or "test"."""
     files = {part: sorted(folder.rglob(f"{part}_split.txt")) for part in LISTED}
     if not files["train"]:
         raise InputError(f"data.split.folder={folder}: has no SUBSET/train_split.txt")

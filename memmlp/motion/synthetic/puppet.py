@@ -358,5 +358,4 @@ def _get_bone(parent: str, child: str) -> Array:
 
 
 def _measure_chain(*chain: str) -> float:
-    """Return the total length of a chain of joints, metres."""
     return float(sum(np.linalg.norm(_get_bone(a, b)) for a, b in pairwise(chain)))

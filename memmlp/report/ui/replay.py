@@ -147,13 +147,13 @@ def find_worst_seconds(errors: np.ndarray) -> list[dict[str, Any]]:
     """
     width = min(FPS, len(errors))
     means = np.convolve(errors, np.ones(width) / width, "valid")
-    found: list[dict[str, Any]] = []
-    while len(found) < WORST_SECONDS and np.isfinite(means).any() and means.max() > -np.inf:
+    seconds: list[dict[str, Any]] = []
+    while len(seconds) < WORST_SECONDS and np.isfinite(means).any() and means.max() > -np.inf:
         first = int(means.argmax())
-        found.append({"first": first, "mean": round(float(means[first]), 3)})
+        seconds.append({"first": first, "mean": round(float(means[first]), 3)})
         gap = width + round(MIN_GAP_SECONDS * FPS)
         means[max(first - gap + 1, 0) : first + gap] = -np.inf
-    return found
+    return seconds
 
 
 def _convert_to_millimetres(joints: np.ndarray) -> list[list[int]]:

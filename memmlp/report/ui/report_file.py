@@ -60,18 +60,18 @@ def write_page(answers: Answers, names: Collection[str], about: str, replays: bo
 
 
 def _select_sweeps(answers: Answers, names: Collection[str]) -> dict[str, KnownSweep]:
-    known = answers.sweeps.known
+    sweeps = answers.sweeps.known
     folder = answers.outputs / "sweeps"
-    if not known:
+    if not sweeps:
         raise InputError(f"{folder}: contains no sweeps; make them with: memmlp sweep")
     shown: dict[str, KnownSweep] = {}
     for name in names:
         stem = f"table{int(name):02}" if name.isdigit() else Path(name).stem
-        found = {one: known[one] for one in known if one == stem or one.startswith(f"{stem}-")}
-        if not found:
-            raise InputError(f"{name}: must be a sweep in {folder}: {', '.join(known)}")
-        shown |= found
-    return shown or known
+        selected = {one: sweeps[one] for one in sweeps if one == stem or one.startswith(f"{stem}-")}
+        if not selected:
+            raise InputError(f"{name}: must be a sweep in {folder}: {', '.join(sweeps)}")
+        shown |= selected
+    return shown or sweeps
 
 
 def _read_curves(run: Run) -> dict[str, Any]:
@@ -101,11 +101,11 @@ def _replay_best_runs(
     answers: Answers, sweeps: Iterable[list[str]], pages: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return replays of each sweep's best run and its control, on the clip with the largest error."""
-    found: dict[str, Any] = {}
+    replays: dict[str, Any] = {}
     for ids in sweeps:
         runs = [answers.index.runs[run_id] for run_id in ids if run_id in answers.index.runs]
         measured = [run for run in runs if ERROR in run["metrics"]]
-        if not measured or len(found) >= MAX_REPLAYS:
+        if not measured or len(replays) >= MAX_REPLAYS:
             continue
         page = pages[f"run/{min(measured, key=lambda run: run['metrics'][ERROR])['id']}"]
         if not page["clips"]:
@@ -114,9 +114,9 @@ def _replay_best_runs(
         for run_id in [page["id"], *([page["control"]["id"]] if page["control"] else [])]:
             piece = answers.replays.get(run_id, clip, MODES[0], begin, REPLAY_SECONDS, timeout=None)
             if piece["state"] == "ready":
-                found[f"replay/{run_id}?{encode_query(clip=clip, mode=MODES[0])}"] = piece
+                replays[f"replay/{run_id}?{encode_query(clip=clip, mode=MODES[0])}"] = piece
                 begin = piece["from"] / piece["fps"]
-    return found
+    return replays
 
 
 def encode_query(**values: str) -> str:

@@ -87,16 +87,16 @@ def describe_units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
     `better` is "lower" or "higher". It is empty for a number that is not an error, such as the truth's
     Jitter. Custom metrics are left out if their package is not in use.
     """
-    found = {}
+    units = {}
     for metric in dict.fromkeys(dotted.rpartition(".")[2] for dotted in metrics):
         if metric in COSTS:
-            found[metric] = {"unit": COSTS[metric], "better": "lower"}
+            units[metric] = {"unit": COSTS[metric], "better": "lower"}
         elif direction := find_direction(metric):
-            found[metric] = {
+            units[metric] = {
                 "unit": find_unit(metric),
                 "better": "" if metric.startswith("GT ") else direction,
             }
-    return found
+    return units
 
 
 def describe_run(index: RunIndex, run_id: str, control: str | None, places: Places) -> dict[str, Any]:
@@ -161,7 +161,6 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
 
 
 def _read_latency(run: Run) -> dict[str, Any]:
-    """Return the measurements of the deployment in the run's config."""
     try:
         record = select_deployed_measurements(run.deployment_as_configured.record)
     except InputError:

@@ -54,10 +54,10 @@ class Searches:
         if name not in self.list_names():
             raise KeyError(name)
         folder = self.outputs / "tune" / name
-        stamp, known = _find_change_time(folder), self.pages.get(name)
-        if known is None or known[0] != stamp:
-            known = self.pages[name] = (stamp, _describe_search(folder))
-        return known[1]
+        stamp, page = _find_change_time(folder), self.pages.get(name)
+        if page is None or page[0] != stamp:
+            page = self.pages[name] = (stamp, _describe_search(folder))
+        return page[1]
 
 
 def _find_change_time(folder: Path) -> int:

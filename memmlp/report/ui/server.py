@@ -56,22 +56,22 @@ class Answers:
         with self.lock:
             started = time.monotonic()
             if started >= self.next_look:
-                found = self.index.refresh(), self.sweeps.refresh(), self.searches.make_stamp()
-                self.state = digest(found)[:16]
+                stamps = self.index.refresh(), self.sweeps.refresh(), self.searches.make_stamp()
+                self.state = digest(stamps)[:16]
                 ended = time.monotonic()
                 self.next_look = ended + max(self.pause, 9 * (ended - started))
             return self.state
 
     def list_places(self) -> dict[str, list[dict[str, Any]]]:
         """Return the sweeps and searches by run id."""
-        found: dict[str, list[dict[str, Any]]] = {}
-        for name, known in self.sweeps.known.items():
-            for entry in known.plan.entries:
+        places: dict[str, list[dict[str, Any]]] = {}
+        for name, sweep in self.sweeps.known.items():
+            for entry in sweep.plan.entries:
                 place = {"sweep": name, "variant": entry.label, "seed": entry.seed}
-                found.setdefault(entry.id, []).append(place)
+                places.setdefault(entry.id, []).append(place)
         for search, number, run_id in self.searches.list_runs():
-            found.setdefault(run_id, []).append({"search": search, "trial": number})
-        return found
+            places.setdefault(run_id, []).append({"search": search, "trial": number})
+        return places
 
     def answer(self, path: str, query: Mapping[str, str]) -> Mapping[str, Any]:
         """Return the answer to a request with a path such as "run/0123456789abcdef".
@@ -89,9 +89,9 @@ class Answers:
                 rows = runs.list_rows(self.index, self.list_places())
                 return {**rows, "state": state, "outputs": str(self.outputs.absolute())}
             case "curves", False:
-                known = [one for one in ID.findall(query.get("runs", "")) if one in self.index.runs]
-                found = [Run.from_id(self.outputs, run_id) for run_id in known[:MAX_CURVES]]
-                return {"curves": {run.id: runs.read_curves(run) for run in found}}
+                run_ids = [one for one in ID.findall(query.get("runs", "")) if one in self.index.runs]
+                found_runs = [Run.from_id(self.outputs, run_id) for run_id in run_ids[:MAX_CURVES]]
+                return {"curves": {run.id: runs.read_curves(run) for run in found_runs}}
             case "body", False:
                 return describe_body()
             case "sweeps", _:
@@ -145,7 +145,7 @@ class RunsHandler(PageHandler):
 
     def _send_answer(self, path: str, query: Mapping[str, str]) -> None:
         try:
-            found = self.server.answers.answer(path, query)
+            answer = self.server.answers.answer(path, query)
         except KeyError:
             self._send_json(404, {"error": self.server.answers.describe_missing(path)})
         except (InputError, ValueError, OverflowError) as error:
@@ -153,7 +153,7 @@ class RunsHandler(PageHandler):
         except Exception as error:  # a damaged folder must not stop the server
             self._send_json(500, {"error": f"{type(error).__name__}: {error}"})
         else:
-            self._send_json(200, found)
+            self._send_json(200, answer)
 
     def _send_json(self, code: int, value: Mapping[str, Any]) -> None:
         try:

@@ -67,22 +67,22 @@ class Sweeps:
 
     def refresh(self) -> str:
         """Read changed sweeps, and return a text that changes when any sweep changes."""
-        known, damaged = {}, {}
+        sweeps, damaged = {}, {}
         for path in self.index.outputs.glob("sweeps/*/plan.json"):
             folder, name = path.parent, path.parent.name
             stamp = tuple(_find_change_time(folder / file) for file in (path.name, SWEEP_FILE, ROUNDS_FILE))
             before = self.known.get(name)
             try:
                 if before and before.stamp == stamp:
-                    known[name] = before
+                    sweeps[name] = before
                 elif (sweep := load_sweep_copy(folder)) is None:
                     damaged[name] = f"{SWEEP_FILE} is missing; start the sweep again"
                 else:
                     plan = replace(Plan.load(path), name=name, outputs=self.index.outputs)
-                    known[name] = KnownSweep(plan, sweep, stamp)
+                    sweeps[name] = KnownSweep(plan, sweep, stamp)
             except (InputError, OSError) as error:
                 damaged[name] = str(error)
-        newest = sorted(known.items(), key=lambda item: -item[1].stamp[0])
+        newest = sorted(sweeps.items(), key=lambda item: -item[1].stamp[0])
         self.known, self.damaged = dict(newest), damaged
         return repr([(name, one.stamp) for name, one in newest])
 
@@ -93,12 +93,12 @@ class Sweeps:
 
     def describe(self, name: str) -> dict[str, Any]:
         """Return the content of a sweep's page. Raises KeyError for an unknown sweep."""
-        known = self.known[name]
-        plan, states = known.plan, self.find_states(known.plan)
-        results = self._get_results(known)
+        known_sweep = self.known[name]
+        plan, states = known_sweep.plan, self.find_states(known_sweep.plan)
+        results = self._get_results(known_sweep)
         values = results["values"]
         return {
-            **self.describe_progress(known, states),
+            **self.describe_progress(known_sweep, states),
             **{key: value for key, value in results.items() if key != "values"},
             "cells": [
                 self._describe_cell(e, states[e.key], values.get((e.label, e.seed))) for e in plan.entries
@@ -110,9 +110,9 @@ class Sweeps:
             ],
         }
 
-    def describe_progress(self, known: KnownSweep, states: Mapping[str, str]) -> dict[str, Any]:
+    def describe_progress(self, known_sweep: KnownSweep, states: Mapping[str, str]) -> dict[str, Any]:
         """Return a sweep's progress, given its tasks' states."""
-        plan, sweep = known.plan, known.sweep
+        plan, sweep = known_sweep.plan, known_sweep.sweep
         counts = {True: Counter[str](), False: Counter[str]()}
         for task in plan.tasks:
             counts[task.kind == NETWORK][states[task.key]] += 1
@@ -168,7 +168,6 @@ class Sweeps:
         }  # fmt: skip
 
     def _count_steps(self, task: RunTask, state: str) -> tuple[int, int]:
-        """Return the total and the remaining number of a task's training steps."""
         facts = self.index.runs.get(task.id) or {}
         total = int(facts.get("steps") or find_training_settings(task.kind, task.config)["steps"] or 0)
         last = facts["recent"][-1][0] if facts.get("recent") else 0
@@ -190,20 +189,20 @@ class Sweeps:
         remaining = sum(left for key, (_, left) in steps.items() if states[key] not in ("failed", "blocked"))
         return remaining * statistics.median(paces) / len(running) if remaining else None
 
-    def _get_results(self, known: KnownSweep) -> dict[str, Any]:
+    def _get_results(self, known_sweep: KnownSweep) -> dict[str, Any]:
         """Return the results of a sweep's runs; compute them again if the sweep or a run has changed."""
         with self.lock:
-            plan, runs = known.plan, self.index.runs
-            stamp = known.stamp, [runs.get(entry.id, {}).get("signature") for entry in plan.entries]
+            plan, runs = known_sweep.plan, self.index.runs
+            stamp = known_sweep.stamp, [runs.get(entry.id, {}).get("signature") for entry in plan.entries]
             before = self.results.get(plan.name)
             if before is None or before[0] != stamp:
-                before = self.results[plan.name] = (stamp, self._compute_results(known))
+                before = self.results[plan.name] = (stamp, self._compute_results(known_sweep))
             return before[1]
 
-    def _compute_results(self, known: KnownSweep) -> dict[str, Any]:
-        plan, flags = known.plan, list[str]()
-        rounds, flag = find_rounds(known.sweep, plan)
-        sweep = rounds.restrict_sweep(known.sweep) if rounds else known.sweep
+    def _compute_results(self, known_sweep: KnownSweep) -> dict[str, Any]:
+        plan, flags = known_sweep.plan, list[str]()
+        rounds, flag = find_rounds(known_sweep.sweep, plan)
+        sweep = rounds.restrict_sweep(known_sweep.sweep) if rounds else known_sweep.sweep
         entries = {(entry.label, entry.seed): entry for entry in plan.entries}
         metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
         values: dict[tuple[str, int], float] = {}

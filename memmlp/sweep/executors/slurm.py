@@ -55,17 +55,17 @@ def parse_slurm_options(settings: Mapping[str, str]) -> SlurmOptions:
     Raises:
         InputError: for an invalid value, and for an option that memmlp sets itself.
     """
-    known = {key.replace("-", "_"): value for key, value in settings.items()}
-    setup, python = known.pop("setup", None), known.pop("python", None)
-    srun = shlex.split(known.pop("srun", ""))
-    containers = sorted(key for key in known if key.startswith("container"))
-    srun += [f"--{key.replace('_', '-')}={known.pop(key)}" for key in containers]
+    values = {key.replace("-", "_"): value for key, value in settings.items()}
+    setup, python = values.pop("setup", None), values.pop("python", None)
+    srun = shlex.split(values.pop("srun", ""))
+    containers = sorted(key for key in values if key.startswith("container"))
+    srun += [f"--{key.replace('_', '-')}={values.pop(key)}" for key in containers]
     parameters: dict[str, str | bool] = {}
-    for key, value in known.items():
+    for key, value in values.items():
         parameters |= _parse_parameter(key, value)
-    if "time" not in known:
+    if "time" not in values:
         raise InputError("slurm.time: has no value; set the time limit of a job with slurm.time=H:MM:SS")
-    return SlurmOptions(parameters, tuple(srun), setup, python, _parse_minutes(known["time"]))
+    return SlurmOptions(parameters, tuple(srun), setup, python, _parse_minutes(values["time"]))
 
 
 def _parse_parameter(key: str, value: str) -> dict[str, str | bool]:

@@ -124,8 +124,10 @@ def compute_importances(study: optuna.Study) -> list[tuple[str, float]]:
     target = None if len(study.directions) == 1 else _get_first_objective
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = optuna.importance.get_param_importances(study, evaluator=_make_evaluator(), target=target)
-    return sorted(found.items(), key=lambda item: -item[1])
+        importances = optuna.importance.get_param_importances(
+            study, evaluator=_make_evaluator(), target=target
+        )
+    return sorted(importances.items(), key=lambda item: -item[1])
 
 
 def explain_missing_importances(study: optuna.Study) -> str | None:
@@ -201,12 +203,12 @@ def list_plots(study: Study) -> dict[str, dict[str, Any]]:
         first = {"target": _get_first_objective, "target_name": names[0]}
         return {"pareto_front": {"target_names": names}, "parallel_coordinate": first, "slice": first}
     titled = {"target_name": names[0]}
-    found: dict[str, dict[str, Any]] = dict.fromkeys(
+    plots: dict[str, dict[str, Any]] = dict.fromkeys(
         ("optimization_history", "parallel_coordinate", "slice"), titled
     )
     if compute_importances(study.study):
-        found["param_importances"] = {**titled, "evaluator": _make_evaluator()}
-    return found
+        plots["param_importances"] = {**titled, "evaluator": _make_evaluator()}
+    return plots
 
 
 def write_plots(study: Study, path: Path) -> None:

@@ -144,7 +144,6 @@ class MotionLoss(Loss):
     def _compute_paper_terms(
         self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
     ) -> Terms:
-        """Return the paper's terms and the hand term."""
         terms: Terms = {}
         if "rotation" in self.branches:
             error = (motion - truth)[..., ROTATION]
