@@ -16,7 +16,7 @@ SCRIPTS = {"plot/d3.min.js": UI_PACKAGE, "plot/plot.umd.min.js": UI_PACKAGE}
 MODULES = {
     **dict.fromkeys(
         ("main.js", "store.js", "filter.js", "format.js", "charts.js", "runs.js", "run.js", "sweeps.js",
-         "searches.js", "compare.js", "replay.js"),
+         "searches.js", "curves.js", "replay.js"),
         UI_PACKAGE,
     ),
     **dict.fromkeys(

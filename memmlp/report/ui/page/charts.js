@@ -1,22 +1,16 @@
-// Charts by Observable Plot, in the page's colours, each with a sentence and a table for screen readers.
+// Charts by Observable Plot, in the page's colours, each with a sentence for screen readers.
 
-import { h, replace, table } from './dom.js';
+import { h, replace } from './dom.js';
 import { number } from './format.js';
 
-const Plot = window.Plot;
+const { d3, Plot } = window;
 export const COLOURS = Array.from({ length: 10 }, (_, i) => `var(--series${i})`);
 
 let latest = 0; // the last chart's width: most have the same, so that a redrawn one does not jump
 
 // A figure that is drawn again when its width changes. draw(width) returns an element.
-export function figure(label, draw, rows) {
+export function figure(label, draw) {
   const frame = h('div', { class: 'plot' });
-  const details = rows && h('details', { class: 'data' }, h('summary', {}, 'Data'), h('div'));
-  details?.addEventListener('toggle', () => {
-    const [heads, ...data] = rows();
-    if (details.open) replace(details.lastChild, table(heads, data.slice(0, 400).map(row => row.map(cell => number(cell)))));
-  });
-  const element = h('figure', { class: 'chart' }, frame, details);
   let width = latest;
   const render = () => {
     if (!width) return;
@@ -31,7 +25,7 @@ export function figure(label, draw, rows) {
     if (wide && wide !== width) { width = latest = wide; render(); }
   }).observe(frame);
   render();
-  return element;
+  return h('figure', { class: 'chart' }, frame);
 }
 
 const base = (width, height, more) => ({
@@ -51,11 +45,11 @@ const tip = (data, options) => Plot.tip(data, Plot.pointer({ fill: 'var(--card)'
 // Curves by group with the band of each group's runs.
 // series: [{ run, group, steps, values }]
 export function curves(series, { label, log = false, smooth = 0, each = false, colours }) {
-  const kept = series.map(one => ({ ...one, values: smoothed(one.values, smooth) })).filter(one => one.steps.length);
+  const kept = series.map(one => smoothed(one, smooth)).filter(one => one.steps.length);
   const groups = [...new Set(kept.map(one => one.group))];
   const bands = groups.flatMap(group => band(kept.filter(one => one.group === group), group));
   const points = kept.flatMap(one => one.steps.map((step, i) => ({ step, value: one.values[i], group: one.group, run: one.run })))
-    .filter(point => point.value !== null && (!log || point.value > 0));
+    .filter(point => !log || point.value > 0);
   const single = new Set(groups.filter(group => kept.filter(one => one.group === group).length === 1));
   const wide = bands.filter(point => !single.has(point.group) && (!log || point.low > 0));
   const lines = each ? points : points.filter(point => single.has(point.group));
@@ -76,47 +70,34 @@ export function curves(series, { label, log = false, smooth = 0, each = false, c
     const mine = points.filter(point => point.group === group);
     return mine.length ? `${group} ends at ${number(mine.at(-1).value)}` : '';
   });
-  const rows = () => [['group', 'step', label], ...thin(points, 200).map(point => [point.group, point.step, point.value])];
-  return figure(`${label} by step. ${last.filter(Boolean).join('; ')}.`, draw, rows);
+  return figure(`${label} by step. ${last.filter(Boolean).join('; ')}.`, draw);
 }
 
 const thin = (points, most) => points.filter((_, i) => i % Math.ceil(points.length / most) === 0);
 
-// An exponential mean without its bias at the beginning; weight 0 leaves the values alone.
-function smoothed(values, weight) {
-  if (!weight) return values;
+// A run without NaN values, as an exponential mean without bias at the beginning; weight 0 keeps the values.
+function smoothed({ steps, values, ...run }, weight) {
   let [sum, norm] = [0, 0];
-  return values.map(value => {
+  const means = values.map(value => {
     if (value === null) return null;
-    sum = weight * sum + (1 - weight) * value;
-    norm = weight * norm + (1 - weight);
+    [sum, norm] = [weight * sum + (1 - weight) * value, weight * norm + (1 - weight)];
     return sum / norm;
   });
+  const known = (_, i) => values[i] !== null;
+  return { ...run, steps: steps.filter(known), values: means.filter(known) };
 }
 
-// Mean, least and largest value of several runs, on steps that all of them cover.
+// Mean and extremes of several runs, interpolated at steps that all of them cover.
 function band(series, group) {
   if (series.length < 2) return [];
-  const first = Math.max(...series.map(one => one.steps[0]));
-  const last = Math.min(...series.map(one => one.steps.at(-1)));
-  const steps = [...new Set(series.flatMap(one => one.steps))].filter(step => step >= first && step <= last).sort((a, b) => a - b);
+  const first = d3.max(series, one => one.steps[0]);
+  const last = d3.min(series, one => one.steps.at(-1));
+  const at = series.map(({ steps, values }) => d3.scaleLinear([...steps, steps.at(-1) + 1], [...values, values.at(-1)]));
+  const steps = [...d3.union(...series.map(one => one.steps))].filter(step => step >= first && step <= last).sort(d3.ascending);
   return thin(steps, 240).map(step => {
-    const values = series.map(one => at(one, step)).filter(value => value !== null);
-    const mean = values.reduce((a, b) => a + b, 0) / values.length;
-    return { step, group, mean, low: Math.min(...values), high: Math.max(...values), count: values.length };
-  }).filter(point => point.count);
-}
-
-function at({ steps, values }, step) {
-  let [low, high] = [0, steps.length - 1];
-  while (high - low > 1) {
-    const middle = (low + high) >> 1;
-    if (steps[middle] <= step) low = middle; else high = middle;
-  }
-  const [a, b] = [values[low], values[high]];
-  if (a === null || b === null) return a ?? b;
-  const part = steps[high] === steps[low] ? 0 : (step - steps[low]) / (steps[high] - steps[low]);
-  return a + Math.min(Math.max(part, 0), 1) * (b - a);
+    const values = at.map(interpolate => interpolate(step));
+    return { step, group, mean: d3.mean(values), low: d3.min(values), high: d3.max(values), count: values.length };
+  });
 }
 
 // Differences from the control with their intervals, and the paper's below them.
@@ -139,46 +120,29 @@ export function forest(rows, { label, smallest }) {
     ],
   }));
   const sentence = known.map(row => `${row.variant}: ${row.words}`).join('; ');
-  return figure(`${label}, differences from the control. ${sentence}`, draw,
-    () => [['variant', 'difference', 'low', 'high', 'paper', 'verdict'], ...rows.map(row => [row.variant, row.mean, row.low, row.high, row.paper, row.verdict ?? ''])]);
+  return figure(`${label}, differences from the control. ${sentence}`, draw);
 }
 
-// Trials' values by number, and the best so far.
-export function history(trials, { label, open }) {
-  let best = Infinity;
-  const line = trials.map(trial => ({ number: trial.number, best: (best = Math.min(best, trial.value)) }));
+// Points { x, y, text, best } in two measures; a line joins the best ones. open(point): called by a click.
+export function scatter(points, { x, y, open }) {
+  const best = points.filter(point => point.best).sort((a, b) => a.x - b.x);
   const draw = width => {
-    const plot = Plot.plot(base(width, 260, {
-      x: { label: 'trial', ticks: Math.min(width / 70, trials.length), tickFormat: 'd' }, y: { label, grid: true, nice: true, ticks: 5 },
+    const plot = Plot.plot(base(width, 280, {
+      x: { label: x, grid: true, nice: true, ticks: Math.min(width / 90, 8), tickFormat: '~r' }, y: { label: y, grid: true, nice: true, ticks: 6 },
       marks: [
-        Plot.line(line, { x: 'number', y: 'best', curve: 'step-after', stroke: 'var(--series1)', strokeWidth: 1.8 }),
-        Plot.dot(trials, { x: 'number', y: 'value', fill: 'var(--series0)', r: 4, fillOpacity: 0.85 }),
-        tip(trials, { x: 'number', y: 'value', title: trial => `trial ${trial.number}\n${number(trial.value)}` }),
+        Plot.line(best, { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.6, curve: 'step-after' }),
+        Plot.dot(points, { x: 'x', y: 'y', r: 4.5, fill: point => (point.best ? 'var(--series1)' : 'var(--series0)'), fillOpacity: 0.85 }),
+        tip(points, { x: 'x', y: 'y', title: 'text' }),
       ],
     }));
     plot.addEventListener('click', () => plot.value && open(plot.value));
     return plot;
   };
-  return figure(`${label} by trial; the best is ${number(best)}.`, draw, () => [['trial', label], ...trials.map(t => [t.number, t.value])]);
+  return figure(`${y} by ${x}; the best are ${best.map(point => number(point.y)).join(', ')}.`, draw);
 }
 
-// Points { id, x, y, text } in two measures; those on the front have the second colour, and a line.
-export function scatter(points, { x, y, front }) {
-  const best = points.filter(point => front.has(point.id)).sort((a, b) => a.x - b.x);
-  const draw = width => Plot.plot(base(width, 300, {
-    x: { label: x, grid: true, nice: true, ticks: Math.min(width / 90, 8), tickFormat: '~r', labelAnchor: 'center', labelArrow: 'none' },
-    y: { label: y, grid: true, nice: true, ticks: 6 },
-    marks: [
-      Plot.line(best, { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.5, curve: 'step-after', strokeDasharray: '4 3' }),
-      Plot.dot(points, { x: 'x', y: 'y', r: 5, fill: point => (front.has(point.id) ? 'var(--series1)' : 'var(--series0)'), fillOpacity: 0.85 }),
-      tip(points, { x: 'x', y: 'y', title: 'text' }),
-    ],
-  }));
-  return figure(`${y} against ${x}; ${best.length} of ${points.length} are in the second colour.`, draw, () => [['', x, y], ...points.map(point => [point.id, point.x, point.y])]);
-}
-
-// Errors over time; a click goes to a moment.
-export function timeline(values, { fps, label, at: when, go, marks, colours }) {
+// Errors over time; a click goes to a moment. The style property --now, from 0 to 1, places a line.
+export function timeline(values, { fps, label, go, marks, colours }) {
   const points = values.flatMap((one, i) => one.errors.map((error, frame) => ({ time: frame / fps, error, name: one.name, i })));
   const draw = width => {
     const plot = Plot.plot(base(width, 120, {
@@ -186,7 +150,6 @@ export function timeline(values, { fps, label, at: when, go, marks, colours }) {
       marks: [
         Plot.rectX(marks, { x1: mark => mark.first / fps, x2: mark => mark.first / fps + 1, fill: 'var(--bad)', fillOpacity: (_, i) => (i ? 0.08 : 0.16) }),
         Plot.line(points, { x: 'time', y: 'error', z: 'i', stroke: point => colours[point.i], strokeWidth: 1.5 }),
-        Plot.ruleX([when()], { stroke: 'var(--ink)', strokeWidth: 1.5, className: 'now' }),
         Plot.ruleX(points, Plot.pointerX({ x: 'time', stroke: 'var(--faint)' })),
       ],
     }));

@@ -4,12 +4,11 @@ import { h, replace, link, empty, say } from './dom.js';
 import { connection, follow, listen, load, place } from './store.js';
 import * as runs from './runs.js';
 import * as run from './run.js';
-import * as compare from './compare.js';
 import * as sweeps from './sweeps.js';
 import * as searches from './searches.js';
 
 const PAGES = {
-  runs: runs.page, run: run.page, compare: compare.page, sweeps: sweeps.page, sweep: sweeps.single, tables: sweeps.tables,
+  runs: runs.page, run: run.page, compare: runs.page, sweeps: sweeps.page, sweep: sweeps.single, tables: sweeps.tables,
   searches: searches.page, search: searches.single,
 };
 const TABS = [['runs', 'Runs'], ['sweeps', 'Sweeps'], ['tables', 'Tables'], ['searches', 'Searches']];

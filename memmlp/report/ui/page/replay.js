@@ -1,6 +1,6 @@
 // A replay: truth, a run and another run side by side in 3D, at one time, from one view.
 
-import { Stage } from './stage.js';
+import { colourScale, measureErrors, Stage } from './stage.js';
 import { h, replace } from './dom.js';
 import { ask, inFile, nameOf } from './store.js';
 import { timeline } from './charts.js';
@@ -104,12 +104,11 @@ export class Replay {
     this.play = h('button', { type: 'button', class: 'primary', onclick: () => { this.playing = !this.playing; } });
     this.slider = h('input', { type: 'range', 'aria-label': 'Time in the clip', min: mine.from, max: mine.from + frames - 1, step: 1, oninput: event => this.go(event.target.valueAsNumber / mine.fps) });
     this.clock = h('output', { class: 'n' });
-    this.chart = timeline(shown.map(([one, data]) => ({ errors: data.errors, name: nameOf(one) })), { fps: mine.fps, label: 'error [cm] by second', at: () => this.time, go: time => this.go(time), marks: mine.worst, colours: COLOURS });
-    const scale = h('div', { class: 'scale' }, '0', h('i', { style: `background:linear-gradient(to right, ${body.heat.join(', ')})` }), `${this.top}+ cm`);
+    this.chart = timeline(shown.map(([one, data]) => ({ errors: data.errors, name: nameOf(one) })), { fps: mine.fps, label: 'error [cm] by second', go: time => this.go(time), marks: mine.worst, colours: COLOURS });
     const keys = h('div', { class: 'keys' }, shown.map(([one], i) => h('span', { class: 'key still' }, h('i', { style: `background:${COLOURS[i]}` }), nameOf(one))));
     replace(this.place, h('div', { class: 'replay', tabindex: 0, role: 'group', 'aria-label': 'Replay; space plays, arrows step a frame', onkeydown: event => this.press(event) },
       h('div', { class: `views of${panels.length}` }, panels.map(panel => panel.element)), h('div', { class: 'transport' }, this.play, this.slider, this.clock),
-      h('div', { class: 'pieces' }, this.pieces.map(one => one.button), scale), keys, this.chart));
+      h('div', { class: 'pieces' }, this.pieces.map(one => one.button), h('div', { class: 'scale' }, colourScale(body.heat, this.top))), keys, this.chart));
     try {
       this.views = panels.map(panel => ({ ...panel, stage: new Stage(panel.canvas, { limbs: body.limbs, heat: body.heat, top: this.top }) }));
     } catch (error) {
@@ -151,9 +150,8 @@ export class Replay {
   draw() {
     const { mine } = this;
     const index = Math.min(Math.max(Math.round(this.time * mine.fps) - mine.from, 0), mine.joints.length - 1);
-    const truth = metres(mine.truth[index]);
     for (const { data, stage, error } of this.views) {
-      const frame = data ? measure(metres(data.joints[index]), truth) : { positions: truth, truth: null, errors: null };
+      const frame = measureErrors(data ? { positions: data.joints[index], truth: mine.truth[index] } : { positions: mine.truth[index] });
       stage.show({ ...frame, restarted: this.jumped });
       if (data) error.textContent = number(frame.mean, 1);
     }
@@ -169,16 +167,6 @@ export class Replay {
     this.clock.textContent = `${this.time.toFixed(2)} s`;
     this.play.textContent = this.playing ? 'Pause' : 'Play';
     document.documentElement.dataset.replayed = `${this.run.id} ${index + mine.from} ${this.views.length}`;
-    const needle = this.chart.querySelector('.now line');
-    if (!needle) return;
-    const x = 56 + (this.time / (Math.max(mine.frames - 1, 1) / mine.fps)) * (Number(needle.closest('svg').getAttribute('width')) - 72);
-    for (const name of ['x1', 'x2']) needle.setAttribute(name, x);
+    this.chart.style.setProperty('--now', (this.time * mine.fps) / Math.max(mine.frames - 1, 1));
   }
-}
-
-const metres = millimetres => Float32Array.from(millimetres, mm => mm / 1000);
-
-function measure(positions, truth) {
-  const errors = Float32Array.from({ length: positions.length / 3 }, (_, j) => 100 * Math.hypot(...[0, 1, 2].map(i => positions[3 * j + i] - truth[3 * j + i])));
-  return { positions, truth, errors, mean: errors.reduce((a, b) => a + b) / errors.length };
 }

@@ -3,7 +3,7 @@
 import { h, replace, link, section, select, choice, code, table } from './dom.js';
 import { address, ask, dataName, inFile, nameOf, place, remember, runs } from './store.js';
 import { ago, ARROWS, better, bytes, date, duration, effectDigits, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
-import { curvePanel } from './compare.js';
+import { curvePanel } from './curves.js';
 import { FINISHED, status, tags } from './runs.js';
 
 const METRICS = ['MPJPE', 'MPJRE', 'MPJVE', 'Jitter', 'Hand PE', 'Upper PE', 'Lower PE', 'Root PE', 'geodesic'];

@@ -1,8 +1,9 @@
-// The table of runs: filter, sort, the columns in which they differ, tags and notes.
+// The table of runs: filter, sort, the columns in which they differ, tags and notes; and chosen runs with their curves.
 
-import { h, replace, link, empty, code, say } from './dom.js';
+import { h, replace, link, section, empty, code, say } from './dom.js';
 import { about, address, dataName, nameOf, place, remember, runs } from './store.js';
 import { parse, matches } from './filter.js';
+import { curvePanel } from './curves.js';
 import { ago, bestOf, better, date, duration, DASH, metricNumber, metricText, metricWords, number, shortKeys, word } from './format.js';
 
 const STEP = 150; // rows that are drawn at once
@@ -38,7 +39,24 @@ export function differing(list, keys) {
   });
 }
 
-export function page() {
+// The ways to group the curves of some runs: by run, by variant of their sweep, by keys in which they differ.
+function groupings(list) {
+  const count = run => list.filter(other => nameOf(other) === nameOf(run)).length;
+  const names = new Map(list.map(run => [run.id, count(run) > 1 ? `${nameOf(run)} (${run.id.slice(0, 6)})` : nameOf(run)]));
+  const keys = differing(list, about.keys).filter(key => key !== 'seed').slice(0, 12);
+  const short = shortKeys(keys);
+  return [
+    ['run', 'run', id => names.get(id)],
+    ...(list.some(run => run.places.length) ? [['variant', 'variant of its sweep', id => runs.get(id)?.places[0]?.variant ?? 'no sweep']] : []),
+    ...keys.map(key => [key, key, id => `${short.get(key)}=${word(runs.get(id)?.config[key])}`]),
+  ];
+}
+
+// All runs, or only the runs with the ids of the address.
+export async function page(name, route) {
+  const only = route.get('runs')?.split(',').filter(id => runs.has(id));
+  if (only && !only.length) throw new Error('None of these runs is here.');
+  const panel = only && curvePanel(only, groupings(only.map(id => runs.get(id))));
   const chosen = new Set((place().query.get('sel') ?? '').split(',').filter(Boolean));
   const ui = { drawn: STEP };
   const counted = h('p', { class: 'count', role: 'status' });
@@ -62,16 +80,17 @@ export function page() {
 
   function draw() {
     const { query } = place();
-    const settings = { text: query.get('filter') ?? '', sort: query.get('sort') ?? '-started', status: query.get('status') ?? '', kind: query.get('kind') === 'all' ? '' : query.get('kind') ?? 'memmlp' };
+    const settings = { text: query.get('filter') ?? '', sort: query.get('sort') ?? '-started', status: query.get('status') ?? '', kind: query.get('kind') === 'all' || only ? '' : query.get('kind') ?? 'memmlp' };
     if (filter.value !== settings.text) filter.value = settings.text;
     kind.value = settings.kind;
     const tests = parse(settings.text);
-    const found = [...runs.values()].filter(run => (!settings.kind || run.kind === settings.kind || (run.damage.length && !run.kind)) && matches(tests, run));
+    const found = [...runs.values()].filter(run => (!only || only.includes(run.id)) && (!settings.kind || run.kind === settings.kind || (run.damage.length && !run.kind)) && matches(tests, run));
     ui.list = sorted(settings.status ? found.filter(run => run.status === settings.status) : found, settings.sort);
     ui.auto = differing(ui.list, about.keys);
     ui.data = [...new Set(ui.list.filter(run => FINISHED.includes(run.status)).map(run => run.data))];
-    const measured = settings.kind === 'vqvae' ? about.metrics.filter(name => name.startsWith('vqvae.')).slice(0, 5) : METRICS.filter(name => ui.list.some(run => typeof run.metrics[name] === 'number'));
-    const groups = [ui.auto.slice(0, KEYS), measured];
+    const metrics = settings.kind === 'vqvae' ? about.metrics.filter(one => one.startsWith('vqvae.')).slice(0, 5) : only ? about.metrics.filter(one => !one.includes('GT ')) : METRICS;
+    const measured = metrics.filter(one => ui.list.some(run => typeof run.metrics[one] === 'number'));
+    const groups = [only ? ui.auto : ui.auto.slice(0, KEYS), measured];
     ui.columns = query.get('cols') === null ? (NARROW.matches ? groups.reverse() : groups).flat() : query.get('cols').split('|').filter(Boolean);
     drawStates(found, settings.status);
     drawDataSets();
@@ -185,11 +204,17 @@ export function page() {
     for (const row of table.tBodies[0]?.rows ?? []) row.classList.toggle('chosen', chosen.has(row.querySelector('input').dataset.run));
   }
 
+  const title = only ? `${only.length} runs` : 'Runs';
   const element = h('div', { class: 'page wide' },
-    h('div', { class: 'bar' }, h('h1', {}, 'Runs'), counted, h('label', { class: 'search' }, h('span', { class: 'hidden' }, 'Filter of runs'), filter), kind, columns, compare),
-    h('div', { class: 'bar' }, chips, dataSets), scroll, nothing);
-  draw();
-  return { title: 'Runs', element, update: () => { draw(); say(`${ui.list.length} runs`); }, close: () => removeEventListener('click', closeMenu) };
+    only && h('p', { class: 'trail' }, link('#/runs', 'Runs')),
+    h('div', { class: 'bar' }, h('h1', {}, title), counted, h('label', { class: 'search' }, h('span', { class: 'hidden' }, 'Filter of runs'), filter), kind, columns, compare),
+    h('div', { class: 'bar' }, chips, dataSets), scroll, nothing, panel && section('Curves', panel.element));
+  async function update() {
+    draw();
+    await panel?.update();
+  }
+  await update();
+  return { title, element, update: () => { update(); say(`${ui.list.length} runs`); }, close: () => removeEventListener('click', closeMenu) };
 }
 
 export const tags = run => run.tags.map(tag => h('span', { class: 'tag' }, tag));

@@ -2,7 +2,7 @@
 
 import { h, replace, link, section, empty, select, table } from './dom.js';
 import { address, ask, place, remember, runs } from './store.js';
-import { history, scatter } from './charts.js';
+import { scatter } from './charts.js';
 import { number, shortKeys, word } from './format.js';
 import { state } from './runs.js';
 
@@ -45,20 +45,24 @@ function body(search, update) {
   if (!complete.length) return [h('p', {}, counts(search)), empty('No trial is complete yet.'), trials(search, short)];
   const objective = search.objectives.includes(place().query.get('objective')) ? place().query.get('objective') : search.objectives[0];
   const text = trial => [`trial ${trial.number}: ${values(trial)}`, ...search.keys.map(key => `${short.get(key)} ${word(trial.params[key])}`)].join('\n');
-  const listed = complete.map(trial => ({
-    ...trial, id: trial.number, value: trial.values[search.objectives.indexOf(objective)], text: text(trial),
-  }));
   const open = trial => { if (runs.has(trial.runs[0])) location.hash = address('run', trial.runs[0]); };
-  const front = new Set(search.front);
-  const best = listed.filter(trial => front.has(trial.id));
+  const best = complete.filter(trial => search.front.includes(trial.number));
+  const points = complete.map(trial => ({ ...trial, text: text(trial), best: best.includes(trial), x: trial.values[0], y: trial.values[1] }));
+  let least = Infinity;
+  const history = points.map(trial => {
+    const value = trial.values[search.objectives.indexOf(objective)];
+    const improves = value < least;
+    if (improves) least = value;
+    return { ...trial, x: trial.number, y: value, best: improves };
+  });
   const meter = share => h('td', { class: 'meter' }, h('i', { style: `width:${100 * share}%` }));
   const importance = search.too_few ? h('p', { class: 'faint' }, search.too_few) : search.importance.length
     ? [h('p', { class: 'faint' }, `${search.importance_is}, by ${search.objectives[0]}`), table(null, search.importance.map(([key, share]) => [short.get(key), meter(share), number(share, 2)]))] : null;
   return [
     h('div', { class: 'sum' }, h('p', {}, counts(search)), h('p', { class: 'best' }, best.length === 1 ? 'Best: ' : 'On the Pareto front: ', best.slice(0, 8).map((trial, i) => [i ? ', ' : '', runLink(trial), ' ', h('b', { class: 'n' }, values(trial))])), search.ends.map(line => h('p', { class: 'faint' }, line))),
     search.objectives.length > 1 ? h('div', { class: 'tools' }, select('Objective', search.objectives.map(one => [one, one]), objective, value => { remember({ objective: value }); update(); })) : null,
-    search.objectives.length === 2 ? section('Pareto front', scatter(listed.map(trial => ({ ...trial, x: trial.values[0], y: trial.values[1] })), { x: search.objectives[0], y: search.objectives[1], front })) : null,
-    h('div', { class: 'pair' }, section('History', history(listed, { label: objective, open })), importance && section('Importance', importance)),
+    search.objectives.length === 2 ? section('Pareto front', scatter(points, { x: search.objectives[0], y: search.objectives[1], open })) : null,
+    h('div', { class: 'pair' }, section('History', scatter(history, { x: 'trial', y: objective, open })), importance && section('Importance', importance)),
     trials(search, short),
   ];
 }

@@ -2,7 +2,7 @@
 
 import { h, replace, link, section, empty, choice, table } from './dom.js';
 import { address, ask, generated, inFile, nameOf, place, remember, runs } from './store.js';
-import { curvePanel } from './compare.js';
+import { curvePanel } from './curves.js';
 import { forest } from './charts.js';
 import { ACTIVE, look, state, STATE_WORDS } from './runs.js';
 import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';

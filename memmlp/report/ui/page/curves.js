@@ -1,13 +1,10 @@
-// Curves of several runs overlaid, by run or by group with bands; where they differ and what was measured.
+// Curves of several runs, overlaid by run or by group with bands.
 
-import { h, replace, link, section, select, empty, choice, table } from './dom.js';
-import { about, address, curvesOf, nameOf, place, remember, runs } from './store.js';
+import { h, replace, select, empty, choice } from './dom.js';
+import { curvesOf, place, remember } from './store.js';
 import { colourOf, curves } from './charts.js';
-import { differing } from './runs.js';
-import { bestOf, metricNumber, metricText, word } from './format.js';
 
-const FIRST = ['train loss', 'val rotation MPJPE', 'val rotation MPJRE'];
-const FIRST_COUNT = 2;
+const DEFAULT = ['train loss', 'val rotation MPJPE', 'val rotation MPJRE']; // the first two that exist
 const title = name => name.replace(/^train /, 'training ').replace(/^val /, 'validation ');
 
 // Curves with their controls, whose settings are kept in the address. A grouping is [name, text, groupOf(id)].
@@ -24,7 +21,7 @@ export function curvePanel(ids, groupings) {
     const names = [...new Set(Object.values(data).flatMap(Object.keys))];
     if (!names.length) return replace(element, empty('No curves yet.', h('p', {}, 'They start with the first entry of the metrics log.')));
     const chosen = setting('y', '').split('|').filter(name => names.includes(name));
-    const usual = FIRST.filter(name => names.includes(name)).slice(0, FIRST_COUNT);
+    const usual = DEFAULT.filter(name => names.includes(name)).slice(0, 2);
     const list = [chosen, usual, names.slice(0, 1)].find(some => some.length);
     const [groupName, , groupOf] = groupings.find(([name]) => name === setting('group')) ?? groupings[0];
     const groups = [...new Set(ids.filter(id => id in data).map(groupOf))];
@@ -59,49 +56,4 @@ export function curvePanel(ids, groupings) {
     if (stamp !== drawn) { drawn = stamp; draw(); }
   }
   return { element, update };
-}
-
-export async function page() {
-  const ids = (place().query.get('runs') ?? '').split(',').filter(id => runs.has(id));
-  if (!ids.length) throw new Error('None of these runs is here.');
-  const list = () => ids.map(id => runs.get(id)).filter(Boolean);
-  const keys = differing(list(), about.keys);
-  const same = run => list().filter(other => nameOf(other) === nameOf(run)).length > 1;
-  const names = new Map(list().map(run => [run.id, same(run) ? `${nameOf(run)} (${run.id.slice(0, 6)})` : nameOf(run)]));
-  const groupings = [
-    ['run', 'run', id => names.get(id)],
-    ...(list().some(run => run.places.length) ? [['variant', 'variant of its sweep', id => runs.get(id)?.places[0]?.variant ?? 'no sweep']] : []),
-    ...keys.filter(key => key !== 'seed').slice(0, 12).map(key => [key, key, id => `${key.replace(/\.name$/, '').split('.').at(-1)}=${word(runs.get(id)?.config[key])}`]),
-  ];
-  const panel = curvePanel(ids, groupings);
-  const tables = h('div');
-  async function update() {
-    replace(tables, differences(list(), names), results(list(), names));
-    await panel.update();
-  }
-  await update();
-  const element = h('div', { class: 'page' }, h('p', { class: 'trail' }, link('#/runs', 'Runs')), h('h1', {}, `${ids.length} runs`), section('Curves', panel.element), tables);
-  return { title: `${ids.length} runs`, element, update };
-}
-
-const heads = (list, names) => ['', ...list.map(run => link(address('run', run.id), names.get(run.id)))];
-
-function differences(list, names) {
-  if (list.length < 2) return null;
-  const keys = about.keys.filter(key => new Set(list.map(run => run.cells[key])).size > 1);
-  const rows = keys.map(key => [key, ...list.map(run => word(run.config[key]))]);
-  return section('Where they differ', rows.length ? table(heads(list, names), rows, { n: false, kind: 'lines', scroll: 'scroll' }) : h('p', { class: 'faint' }, 'Their configs are the same.'));
-}
-
-function results(list, names) {
-  const metrics = about.metrics.filter(name => list.some(run => typeof run.metrics[name] === 'number') && !name.includes('GT '));
-  if (!metrics.length) return null;
-  const comparable = new Set(list.map(run => run.data)).size === 1; // errors on several data sets are not comparable
-  const row = name => {
-    const values = list.map(run => run.metrics[name]);
-    const best = comparable ? bestOf(name, values.filter(value => typeof value === 'number')) : null;
-    return [metricText(name), ...values.map(value => h('span', { class: value !== undefined && value === best ? 'least' : '' }, metricNumber(name, value)))];
-  };
-  const note = comparable ? null : h('p', { class: 'faint' }, 'These runs are on several data sets; their errors are not comparable.');
-  return section('Measured', note, table(heads(list, names), metrics.map(row), { kind: 'lines', scroll: 'scroll' }));
 }
