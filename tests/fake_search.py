@@ -25,6 +25,7 @@ def search(**changes: Any) -> Search:
     content: dict[str, Any] = {
         "name": "mine", "base": ["loss=manual"], "space": {"loss": SPACE}, "objectives": ["MPJPE"],
         "n_trials": 6, "seeds": 1, "sampler": "tpe", "startup": 3, "seed": 0, "pruner": "none",
+        "tflop": None,
         "prune_after": 2, "storage": None,
     }  # fmt: skip
     return parse_search({**content, **changes})

@@ -18,6 +18,7 @@ import numpy as np
 import tiny
 import torch
 from golden_trained import Numbers, frames, optimised, parts, refiner, summary, training, vqvae
+from tiny_tasks import OPTIM, TASKS
 from torch import Tensor
 
 from memmlp.deploy import latency
@@ -49,6 +50,7 @@ from memmlp.networks.predictor import (
 from memmlp.networks.recurrent_poser import CELLS
 from memmlp.networks.streaming import make_streaming_graph
 from memmlp.runs.identity import find_version
+from memmlp.training.compute import measure_step
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
     AGRoLLoss,
@@ -176,6 +178,15 @@ def loss(make: Callable[[], Loss]) -> Numbers:
     groups = [len(group["params"]) for group in one.weighting.parameter_groups()]
     found = {name: float(term.detach()) for name, term in terms.items()} | {"learned": float(sum(groups))}
     return found | {"total": float(total.detach())} | summary("slope", motion.grad)
+
+
+def steps_compute() -> Numbers:
+    """The FLOPs of a training step of several networks, and of two optimisers."""
+    found = {}
+    for name in ("own", "recurrent forced", "avatar_poser", "hmd_poser", "upper_codes"):
+        found[name] = measure_step(TASKS[name](), OPTIM).network
+    muon = Muon(steps=12, batch=4, lr=1e-3)
+    return found | {"muon": measure_step(TASKS["forced"](optim=muon), muon).optimiser}
 
 
 def mixed() -> Numbers:
@@ -308,6 +319,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "ema": partial(optimised, ema=0.5),
     "warmup": partial(optimised, warmup=3),
     "precision.bf16": mixed,
+    "compute": steps_compute,
     "rollout.teacher_forcing": partial(rollout, TeacherForcing),
     "rollout.own_predictions": partial(rollout, partial(OwnPredictions, 2)),
     "rollout.streams": partial(rollout, partial(PersistentStreams, 4)),

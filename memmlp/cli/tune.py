@@ -42,7 +42,8 @@ def tune(
 
     OVERRIDES can be overrides of `memmlp train` for all trials, settings of the executor as in `memmlp
     sweep`, or settings of the search: `search.n_trials=50`, `search.seeds=3`,
-    `search.objectives=[MPJPE,Jitter] search.pruner=none`, or `+search.space.optim.lr={low: 1e-4, high: 1e-2,
+    `search.objectives=[MPJPE,Jitter] search.pruner=none`, `search.tflop=5` for the same compute in each
+    training, or `+search.space.optim.lr={low: 1e-4, high: 1e-2,
     log: true}`. `search=NAME` selects conf/search/NAME.yaml. A restarted search continues where it stopped.
     """
     from memmlp.common.files import write_json
@@ -85,7 +86,14 @@ class SearchSetup(NamedTuple):
         Overrides of the search file and of the command line come before the values. By default, trials are
         neither exported nor timed. They are only evaluated on validation clips.
         """
-        return ["export.graph=off", *self.search.base, *self.command_line, *self.search.overrides(values)]
+        fixed = self.search.budget
+        return [
+            "export.graph=off",
+            *fixed,
+            *self.search.base,
+            *self.command_line,
+            *self.search.overrides(values),
+        ]
 
     @property
     def config_options(self) -> list[str]:
@@ -113,9 +121,9 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     parsed = parse_search(content)
     remaining = tuple(text for text in overrides if text not in own)
     setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
+    base = _check_space(setup)
     if not _make_requests(setup, {})[0].motion.prepare().has("val"):
         raise InputError("data.split.val: must be above 0 for a search, which ranks trials on validation")
-    base = _check_space(setup)
     counted = {**asdict(parsed), "n_trials": None, "storage": None}
     return setup._replace(folder=outputs / "tune" / f"{parsed.name}-{digest([base, counted])[:8]}")
 

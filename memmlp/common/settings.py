@@ -66,6 +66,15 @@ def fraction() -> Rule:
     return within(0, 1)
 
 
+def steps_or_fraction(zero: bool = True) -> Rule:
+    """Return the rule for a number of steps, or a fraction of all steps; `zero` allows 0."""
+
+    def allows(value: Any) -> bool:
+        return 0 < value < 1 or (value >= 1 and value % 1 == 0) or (zero and value == 0)
+
+    return Rule(f"a whole number of steps, or a fraction {'below' if zero else 'between 0 and'} 1", allows)
+
+
 def seed() -> Rule:
     """Return the rule that a number must be a valid seed for torch."""
     return within(0, 2**63 - 1)

@@ -36,6 +36,7 @@ VERSIONS: dict[str, int] = {
     "schedule.cosine": 1,
     "schedule.milestones": 1,
     "ema": 1,
+    "compute": 1,
     "warmup": 1,
     "precision.bf16": 2,
     "weighting.learned": 2,
@@ -256,6 +257,8 @@ def list_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
     if schedule := optim.get("schedule"):
         yield f"schedule.{schedule}"
     yield from (name for name in ("warmup", "ema") if optim.get(name))
+    if optim.get("tflop"):
+        yield "compute"
     if optim.get("precision") == "bf16":
         yield "precision.bf16"
     if kind == "vqvae" or find_option(config, "memory") == "vq_joint":
@@ -283,6 +286,10 @@ def select_training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     out = (*NEUTRAL, *EVALUATION, *DEPLOYMENT, *(() if as_live else INFERENCE))
     flat = {key: value for key, value in flatten(config).items() if value is not None}
     counting = [key for key in flat if DRAWS.fullmatch(key) or not _is_below(key, out)]
+    if "optim.tflop" in counting:  # it sets the number of steps
+        counting.remove("optim.steps")
+    if "optim.best_by" in counting:
+        counting.append("optim.validate_every")
     return {key: _normalize_numbers(flat[key]) for key in counting}
 
 

@@ -86,7 +86,7 @@ def count_training_frames(run: Run) -> float:
     config = run.config
     refiner, optim, model = (config.get(name) or {} for name in ("refiner", "optim", "model"))
     length = (refiner or model).get("frames") or 0
-    seen = float((optim.get("steps") or 0) * (optim.get("batch") or 0) * length)
+    seen = float(run.total_steps * (optim.get("batch") or 0) * length)
     if not refiner:
         return seen
     before = count_training_frames(Run(run.folder.parent / str(run.manifest.get("prerequisite"))))

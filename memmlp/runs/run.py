@@ -34,6 +34,7 @@ from memmlp.runs.evaluation_file import ConfiguredEvaluations, is_intact
 from memmlp.runs.identity import (
     belongs_to_folder,
     describe_export_difference,
+    find_training_settings,
     has_configured_inference,
     select_deployment_settings,
 )
@@ -393,6 +394,23 @@ class Run:
     def step(self) -> int:
         """The last logged training step; 0 before the first."""
         return max((entry.step for entry in self.metrics()), default=0)
+
+    @property
+    def kept_validation(self) -> LogRecord | None:
+        """The validation of the run's weights: the best one with `optim.best_by`, otherwise the last one."""
+        found = [entry for entry in self.metrics() if entry.phase == "val"]
+        best = self.manifest.get("best_step")
+        return next((entry for entry in reversed(found) if best in (None, entry.step)), None)
+
+    @property
+    def total_steps(self) -> int:
+        """The number of steps of the whole training; 0 if unknown."""
+        if steps := self.manifest.get("steps"):
+            return int(steps)
+        try:
+            return int(find_training_settings(str(self.manifest.get("kind")), self.config)["steps"] or 0)
+        except (KeyError, TypeError):
+            return 0
 
     def metrics(self) -> list[LogRecord]:
         """Return all records of the metrics log (`MetricsLog.read`)."""

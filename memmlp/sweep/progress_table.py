@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from memmlp.runs.identity import NETWORK, find_training_settings
+from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import describe_kind
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
@@ -100,7 +100,7 @@ class Board(Screen):
 
         def describe_running() -> list[str]:
             return [
-                f"{describe_task(plan, task)}: {describe_progress(plan.get_run(task), count_steps(task))}"
+                f"{describe_task(plan, task)}: {describe_progress(plan.get_run(task))}"
                 for task in plan.tasks
                 if states[task.key] == "running"
             ]
@@ -169,7 +169,7 @@ def format_state(plan: Plan, task: RunTask, state: str) -> Text:
     """Return a short text for the state of a task's run."""
     run, style = plan.get_run(task), COLOURS.get(state, "")
     if state == "running":
-        return Text(describe_progress(run, count_steps(task)), style=style)
+        return Text(describe_progress(run), style=style)
     if state == "done":
         return Text(format_result(run) or state, style=style)
     return Text(STATE_NAMES.get(state, state), style=style)
@@ -181,13 +181,9 @@ def format_result(run: Run) -> str:
     return f"{value:.2f} cm" if isinstance(value, int | float) else ""
 
 
-def count_steps(task: RunTask) -> int:
-    """Return the number of training steps of a task."""
-    return int(find_training_settings(task.kind, task.config)["steps"])
-
-
-def describe_progress(run: Run, total: int) -> str:
+def describe_progress(run: Run) -> str:
     """Return a running run's training steps, remaining time and loss as text."""
+    total = run.total_steps
     if (doing := run.activity) in ("evaluating", "exporting"):
         return doing
     log = [entry for entry in run.metrics() if entry.phase == "train"]

@@ -18,10 +18,12 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.progress import ProgressCounter, label_progress, notify, show_progress
+from memmlp.common.progress import ProgressCounter, announce, label_progress, notify, show_progress
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
+from memmlp.training.best_weights import BestWeights
+from memmlp.training.compute import measure_step
 from memmlp.training.optim import Average, Optim
 
 
@@ -63,6 +65,10 @@ class TrainingTask:
         """Return further values to log besides the loss terms; by default an empty dict."""
         return {}
 
+    def average_over_draws(self, measure: Callable[[], float]) -> float:
+        """Return the mean of a step's measure, if the number of network calls in a step is random."""
+        return measure()
+
     def validate(self) -> dict[str, float]:
         """Compute the metrics on the validation split; {} without validation clips."""
         raise NotImplementedError
@@ -85,10 +91,11 @@ def train(
     description: str,
     on_validation: ValidationCallback | None = None,
 ) -> None:
-    """Train until step `settings.steps`, starting from the run's checkpoint if there is one.
+    """Train for `optim.steps` or `optim.tflop`, starting from the run's checkpoint if there is one.
 
     The last checkpoint stays in the run's folder. The module is left with the final weights, which may be an
-    average over steps.
+    average over steps, or the best ones on validation. The run's manifest records the number of steps and the
+    compute.
 
     Args:
         task: what to train.
@@ -103,9 +110,11 @@ def train(
         InputError: if several processes would not give the same result as one process.
     """
     check_processes(task, settings, description)
+    settings = plan_steps(task, settings, run, description)
     optimiser = settings.build(task.parameter_groups())
     average = settings.make_average(task.module, optimiser)
-    start, spent = resume(task, optimiser, average, run)
+    best = BestWeights(task.module, settings.best_by)
+    start, spent = resume(task, optimiser, average, best, run)
     started = time.monotonic() - spent
     if start and distributed.is_first():
         notify(f"{description}: resumes from the last checkpoint, at step {start} of {settings.steps}")
@@ -119,13 +128,30 @@ def train(
             average.update(step + 1)
             first = distributed.is_first()
             validation = record(task, settings, average, run, step + 1, result, count) if first else {}
+            if validation:
+                best.update(step + 1, validation, average)
             if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
-                save(task, optimiser, average, run, step + 1, time.monotonic() - started)
+                save(task, optimiser, average, best, run, step + 1, time.monotonic() - started)
             if validation and on_validation:
                 on_validation(step + 1, validation)
     if distributed.is_first():
         run.record_seconds("train", time.monotonic() - started)
+        run.write_manifest({"best_step": best.step or None})
     average.write_into_module()
+    best.write_into_module()
+
+
+def plan_steps(task: TrainingTask, settings: Optim, run: Run, description: str) -> Optim:
+    """Return settings with whole numbers of steps (`Optim.resolve`), and record them with their compute."""
+    compute, spent = measure_step(task, settings), run.manifest.get("prerequisite_tflop", 0.0)
+    resolved = settings.resolve(compute.tflop, spent)
+    if distributed.is_first():
+        if settings.tflop is not None:
+            announce(f"{description}: {resolved.steps} steps for optim.tflop={settings.tflop:g}")
+        gflop = {"network_gflop": compute.network / 1e9, "optimiser_gflop": compute.optimiser / 1e9}
+        total = None if spent is None else spent + resolved.steps * compute.tflop
+        run.write_manifest({"steps": resolved.steps, "tflop": total, "step": gflop})
+    return resolved
 
 
 def check_processes(task: TrainingTask, settings: Optim, description: str) -> None:
@@ -225,6 +251,7 @@ def save(
     task: TrainingTask,
     optimiser: torch.optim.Optimizer,
     average: Average,
+    best: BestWeights,
     run: Run,
     step: int,
     seconds: float,
@@ -240,13 +267,19 @@ def save(
     tensors = checkpoint.collect_module_tensors("module", task.module) | checkpoint.collect_optimiser_tensors(
         optimiser
     )
-    tensors |= average.tensors()
+    tensors |= average.tensors() | best.tensors()
     tensors["rng.torch"] = torch.get_rng_state()
-    checkpoint.write(run.checkpoint, tensors, {"step": step, "initial_lr": rates, "seconds": seconds})
+    checkpoint.write(
+        run.checkpoint, tensors, {"step": step, "initial_lr": rates, "seconds": seconds, **best.values()}
+    )
 
 
 def resume(
-    task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run
+    task: TrainingTask,
+    optimiser: torch.optim.Optimizer,
+    average: Average,
+    best: BestWeights,
+    run: Run,
 ) -> tuple[int, float]:
     """Load the run's checkpoint if there is one; return the numbers of finished steps and of seconds."""
     state = checkpoint.read(run.checkpoint) if distributed.is_first() and run.checkpoint.exists() else None
@@ -257,6 +290,7 @@ def resume(
     checkpoint.load_module("module", task.module, tensors)
     checkpoint.load_optimiser(optimiser, tensors)
     average.load(tensors)
+    best.load(tensors, values)
     torch.set_rng_state(tensors["rng.torch"])
     for group, rate in zip(optimiser.param_groups, values["initial_lr"], strict=True):
         group["initial_lr"] = rate

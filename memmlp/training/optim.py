@@ -21,7 +21,16 @@ from torch.overrides import TorchFunctionMode
 
 from memmlp.common.components import component
 from memmlp.common.errors import InputError
-from memmlp.common.settings import Settings, at_least, fraction, one_of, positive, setting, within
+from memmlp.common.settings import (
+    Settings,
+    at_least,
+    fraction,
+    one_of,
+    positive,
+    setting,
+    steps_or_fraction,
+    within,
+)
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     # Each maps the progress in [0, 1), final rate / first rate and `drop_at` to the factor on the first rate.
@@ -39,19 +48,23 @@ class OptimSettings(Settings):
     """The keys that all optimisers have."""
 
     steps: int = setting(at_least(1), "${profile.steps}")
+    # training compute in TFLOP, with prerequisite runs; it sets the number of steps. null: `steps` does
+    tflop: float | None = setting(positive(), None)
     batch: int = setting(at_least(1), "${profile.batch}")  # number of windows per step
     lr: float = setting(positive(), "${profile.lr}")
     weight_decay: float = setting(at_least(0), 1.0e-4)
-    warmup: int = setting(at_least(0), 0)  # number of initial steps with a growing learning rate; 0: none
+    # number of initial steps with a growing learning rate, or below 1 a fraction of the steps; 0: none
+    warmup: int | float = setting(steps_or_fraction(), 0)
     clip_norm: float = setting(at_least(0), 0.0)  # maximum norm of the gradient; 0: no limit
     precision: str = setting(one_of("fp32", "bf16"), "fp32")
     compile: bool = setting(default=False)  # true: compile the network with torch.compile
     checkpoint_every: int = setting(
         at_least(1), "${profile.checkpoint_every}"
     )  # number of steps between checkpoints
-    validate_every: int = setting(
-        at_least(1), "${profile.validate_every}"
-    )  # number of steps between validations
+    # number of steps between validations, or below 1 a fraction of the steps
+    validate_every: int | float = setting(steps_or_fraction(zero=False), "${profile.validate_every}")
+    # rotation or position: keep the weights with the lowest validation MPJPE of this branch; null: the last
+    best_by: str | None = setting(one_of("rotation", "position"), None)
     log_every: int = setting(
         at_least(1), "${profile.log_every}"
     )  # number of steps between metrics log entries
@@ -62,8 +75,12 @@ class OptimSettings(Settings):
         own = config["optim"]
         if own.get("final_lr", 0) > own["lr"]:
             yield f"optim.final_lr={own['final_lr']}: must be at most optim.lr={own['lr']}"
-        if own["warmup"] > own["steps"]:
+        if own["tflop"] is None and own["warmup"] > own["steps"]:
             yield f"optim.warmup={own['warmup']}: must be at most optim.steps={own['steps']}"
+        if own["tflop"] is not None and own["warmup"] >= 1:
+            yield f"optim.warmup={own['warmup']}: must be below 1, a fraction of the steps, with optim.tflop"
+        if own["tflop"] is not None and config["refiner"] is not None:
+            yield f"optim.tflop={own['tflop']}: must be null with a refiner, which has two trainings"
 
 
 @component("optim", "adamw", builds="Optim")
@@ -123,7 +140,7 @@ class Optim:
     final_lr: float = 0.0
     schedule: str = "step"
     drop_at: float = 0.75
-    warmup: int = 0
+    warmup: float = 0
     ema: float | None = None
     weight_decay: float = 1e-4
     betas: tuple[float, float] = (0.9, 0.999)
@@ -132,8 +149,10 @@ class Optim:
     precision: str = "fp32"
     compile: bool = False
     checkpoint_every: int = 500
-    validate_every: int = 1000
+    validate_every: float = 1000
     log_every: int = 50
+    tflop: float | None = None
+    best_by: str | None = None
 
     def with_lr(self, lr: float | None) -> Self:
         """Return a copy with another initial learning rate; the final rate is scaled by the same factor.
@@ -142,6 +161,29 @@ class Optim:
             lr: initial learning rate; None changes nothing.
         """
         return self if lr is None else replace(self, lr=lr, final_lr=self.final_lr * lr / self.lr)
+
+    def resolve(self, step_tflop: float, spent: float | None = 0.0) -> Self:
+        """Return a copy with whole numbers of steps, instead of a compute budget and fractions.
+
+        Args:
+            step_tflop: the compute of a training step, TFLOP.
+            spent: the compute of the prerequisite runs, TFLOP; None if unknown.
+
+        Raises:
+            InputError: if the budget `tflop` is too small for a step, or `spent` is unknown.
+        """
+        steps = self.steps
+        if self.tflop is not None and spent is None:
+            raise InputError(
+                "optim.tflop: the prerequisite run has no record of its compute; remove its folder"
+            )
+        if self.tflop is not None:
+            steps = round((self.tflop - (spent or 0)) / step_tflop)
+            if steps < 1:
+                least = f"{spent:.3g} TFLOP of prerequisite runs and {step_tflop:.3g} of each step"
+                raise InputError(f"optim.tflop={self.tflop:g}: must be above {least}")
+        warmup, often = (int(one if one >= 1 else one * steps) for one in (self.warmup, self.validate_every))
+        return replace(self, steps=steps, warmup=warmup, validate_every=max(often, 1))
 
     def compute_factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of the initial learning rate."""

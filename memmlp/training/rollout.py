@@ -6,6 +6,7 @@ A network that is trained only on true history learns to rely on it, but does no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -54,6 +55,10 @@ class Rollout(nn.Module):
     def keep(self, state: State) -> None:
         """Store the state after a training step for later steps; by default nothing is stored."""
 
+    def average_over_draws(self, measure: Callable[[], float]) -> float:
+        """Return the mean of a training step's measure, if the rollout draws the number of network calls."""
+        return measure()
+
 
 @component("rollout", "teacher_forcing")
 class TeacherForcing(Rollout):
@@ -92,6 +97,7 @@ class OwnPredictions(Rollout):
     def __init__(self, max_passes: int):
         super().__init__()
         self.max_passes = max_passes
+        self.passes: int | None = None  # a fixed number of calls
 
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
@@ -99,7 +105,8 @@ class OwnPredictions(Rollout):
         """Draw the batch of a training step, and predict its history."""
         clips, end = map(distributed.take_local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
-        passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
+        drawn = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
+        passes = drawn if self.passes is None else self.passes
         stretch = dataset.read_stretches(clips, end, past + stride * (passes + 1))
         sparse = stretch[..., :SPARSE_DIM]
         state = model.running_state(sparse[:, :past])
@@ -111,6 +118,15 @@ class OwnPredictions(Rollout):
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         model.train()
         return TrainingCall(sparse[:, -stride:], state, stretch[:, -model.frames :], clips)
+
+    def average_over_draws(self, measure: Callable[[], float]) -> float:
+        """Return the mean of a measure that grows linearly with the number of calls."""
+        found = 0.0
+        for passes in (0, self.max_passes):
+            self.passes = passes
+            found += measure() / 2
+        self.passes = None
+        return found
 
 
 @component("rollout", "streams", version=2, builds="PersistentStreams")

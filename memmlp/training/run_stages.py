@@ -131,7 +131,10 @@ def run_experiment(experiment: Experiment, on_validation: ValidationCallback | N
     if not run.done:
         if experiment.evaluations:
             data.open("test")  # reports missing test clips before the training, not after it
-        experiment.training.optim.check_installed()
+        optim = experiment.training.optim
+        optim.check_installed()
+        if optim.best_by and not data.has("val"):
+            raise InputError(f"optim.best_by={optim.best_by}: must be null without validation clips")
         if overlooked := describe_unused_gpu(config["device"]):
             notify(overlooked)
     before = None if run.done and not config["force"] else make_prerequisites(experiment, data)
@@ -268,8 +271,9 @@ def train_run(
     on_validation: ValidationCallback | None = None,
 ) -> None:
     """Train a run's network from the weights of the run `before`, and mark the run as done."""
-    steps = experiment.training.optim.steps
-    announce(f"network: training for {steps} steps (run {run.id})")
+    optim = experiment.training.optim
+    length = f"{optim.steps} steps" if optim.tflop is None else f"{optim.tflop:g} TFLOP"
+    announce(f"network: training for {length} (run {run.id})")
     begin_run(experiment, run, experiment.identity(data.digest), experiment.config, before)
     facts = {"body": data.manifest.body, "validation_clips": len(data.manifest.part("val"))}
     run.write_manifest(facts | collect_data_warnings(experiment.config, data))
@@ -347,7 +351,10 @@ def begin_run(
     counting: Mapping[str, Any] = {**(above.config if above else {}), **identity.config}
     facts = {
         **(
-            {PREREQUISITES: list_prerequisite_origins(before.manifest, before.weights_digest)}
+            {
+                PREREQUISITES: list_prerequisite_origins(before.manifest, before.weights_digest),
+                "prerequisite_tflop": before.manifest.get("tflop"),
+            }
             if before
             else {}
         ),

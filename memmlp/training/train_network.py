@@ -63,7 +63,7 @@ class Training:
             on_validation: called after each validation; see `memmlp.training.loop.train`.
 
         Returns:
-            The errors of the last validation; empty in a process that does not validate.
+            The validation errors of the kept weights; empty in a process that does not validate.
         """
         raise NotImplementedError
 
@@ -78,10 +78,9 @@ def make_validation(
     return lambda network: modes.measure_stream(network, pieces, metrics)
 
 
-def read_last_errors(run: Run) -> dict[str, float]:
-    """Return the errors of a run's last validation; empty in a process that does not validate."""
-    found = [entry.values for entry in run.metrics() if entry.phase == "val"]
-    return dict(found[-1]) if found else {}
+def read_kept_errors(run: Run) -> dict[str, float]:
+    """Return the validation errors of a run's weights; empty in a process that does not validate."""
+    return dict(run.kept_validation.values) if run.kept_validation else {}
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ class NetworkTraining(Training):
         train(task, self.optim, run, self.seed, "network", on_validation)
         if distributed.is_first():
             checkpoint.write(run.model, checkpoint.collect_module_tensors("model", task.model), {})
-        return read_last_errors(run)
+        return read_kept_errors(run)
 
     def make_task(
         self,
@@ -189,6 +188,10 @@ class MotionTask(TrainingTask):
         true = call.true_frames[:, -motion.shape[1] :].repeat(members, 1, 1)
         loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.normalizer)
         return StepResult(sum(own.values(), loss), terms | own, call.clips)
+
+    def average_over_draws(self, measure: Callable[[], float]) -> float:
+        """Return the mean of a step's measure over the rollout's draws; see Rollout."""
+        return self.rollout.average_over_draws(measure)
 
     def report(self) -> dict[str, float]:
         """Return the weights of the loss terms."""

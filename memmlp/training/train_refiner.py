@@ -26,7 +26,7 @@ from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, t
 from memmlp.training.losses import FixedWeights, Loss, Terms, TermsLoss
 from memmlp.training.losses.terms import Comparison, measure_jerk
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import Training, make_validation, read_last_errors
+from memmlp.training.train_network import Training, make_validation, read_kept_errors
 
 STREAMS_TOGETHER = 64  # pieces that the network streams through side by side
 
@@ -129,7 +129,7 @@ class RefinerTraining(Training):
         train(task, self.optim, run, self.seed, "refiner", on_validation)
         finished.requires_grad_(True)
         checkpoint.write(run.model, checkpoint.collect_module_tensors("model", model), {})
-        return read_last_errors(run)
+        return read_kept_errors(run)
 
     def draw_pieces(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
         """Draw the pieces: frames (P, n, 252), and the clip index of each piece (P,)."""

@@ -34,7 +34,7 @@ from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
 from memmlp.training.losses.terms import BodyMotion
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import NetworkTraining, Training, read_last_errors
+from memmlp.training.train_network import NetworkTraining, Training, read_kept_errors
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
 """SAGE-Net's parts in training order; each part uses the parts before it."""
@@ -200,7 +200,7 @@ class SAGEPartTraining(Training):
         train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "), on_validation)
         if distributed.is_first():
             checkpoint.write(run.model, before | checkpoint.collect_module_tensors(name, part), {})
-        return read_last_errors(run)
+        return read_kept_errors(run)
 
 
 @dataclass(frozen=True)

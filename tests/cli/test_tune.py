@@ -202,3 +202,27 @@ def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
     said = "\n".join(examine(outputs, 2))
     assert "trial 0: not the mean of its runs" in said
     assert "of no trial" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("network", ["mem_mlp", "avatar_poser", "recurrent_poser"])
+def test_every_trial_trains_for_the_same_compute(network: str, tmp_path: Path):
+    """The batch is searched, and so is the number of steps; the objective is of the best validation."""
+    budget, own = 0.005, [word for word in TINY if "steps" not in word and "validate" not in word]
+    space = ["search.space.optim=null", "+search.space.optim.batch={choices: [4, 8]}"]
+    words = [
+        f"model={network}",
+        "search=learning_rate",
+        *space,
+        "search.n_trials=2",
+        f"search.tflop={budget}",
+    ]
+    run_apart(tmp_path, "tune", *own, *words, "--workers", "1")
+    rows = list(csv.DictReader((folder_of(tmp_path) / "trials.csv").read_text().splitlines()))
+    runs = [Run.from_id(tmp_path / "outputs", row["run"]) for row in rows]
+    assert [run.manifest["tflop"] for run in runs] == pytest.approx([budget, budget], rel=0.05)
+    assert runs[0].total_steps > 1.4 * runs[1].total_steps
+    for row, run in zip(rows, runs, strict=True):
+        errors = [e.values["rotation MPJPE"] for e in run.metrics() if e.phase == "val"]
+        assert len(errors) in (10, 11)
+        assert float(row["MPJPE"]) == min(errors)

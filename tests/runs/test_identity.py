@@ -83,3 +83,16 @@ def test_keys_of_later_stages_and_neutral_keys_cannot_change_a_training():
     config = {**CONFIG, "evaluation": {"ik": "off"}, "loggers": {"mlflow": {"name": "mlflow"}}}
     keys = ("model.width", "model", "data.root", "optim.log_every", "evaluation.ik", "loggers")
     assert [affects_training(key, config) for key in keys] == [True, True, True, False, False, False]
+
+
+def test_a_budget_counts_instead_of_steps_and_validations_where_they_choose_the_weights():
+    def moved(base: dict[str, object], **changes: object) -> bool:
+        return identity(CONFIG | {"optim": base | changes}) != identity(CONFIG | {"optim": base})
+
+    steps = {"lr": 1e-3, "steps": 5, "validate_every": 2}
+    assert moved(steps, steps=6)
+    assert not moved(steps, validate_every=3)
+    assert moved(steps, tflop=5.0)
+    assert not moved(steps | {"tflop": 5.0}, steps=6)
+    assert moved(steps | {"tflop": 5.0}, tflop=6.0)
+    assert moved(steps | {"best_by": "rotation"}, validate_every=3)

@@ -30,6 +30,7 @@ LabelledRuns = Sequence[tuple[str, MeasuredRun]]
 
 BUILT_IN_BODY = "builtin"
 MAX_TRAINING_RATIO = 1.1  # maximum ratio of training frames between variant and control without a flag
+MAX_BUDGET_ERROR = 0.05  # maximum relative difference of compute from its budget without a flag
 UNGROUPED_FRACTION = 0.75  # fraction of ungrouped test clips from which a flag asks for groups
 SMPLH_TABLES = (1, 2, 3)  # the paper's tables on AMASS, which use SMPL-H bodies
 MAX_FILES = 5  # maximum number of file names in a flag
@@ -91,6 +92,7 @@ def find_flags(
     if has_errors:
         yield from _flag_short_training(every)
     yield from _flag_unequal_training(sweep, runs)
+    yield from _flag_missed_budgets(every)
     yield from _flag_data_warnings(every, "partial", ", and no more")
     yield from _flag_data_warnings(every, "divided")
     yield from _flag_unequal_versions(every)
@@ -351,12 +353,27 @@ def _flag_unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iter
 
     unequal = []
     for variant, other in list_comparisons(sweep):
+        budgets = {run.training.get("budget") for one in (variant, other) for run in runs[one.label].values()}
+        if len(budgets) == 1 and None not in budgets:
+            continue  # equal compute
         both = frames[variant.label] + frames[other.label]
         if frames[variant.label] and frames[other.label] and max(both) > MAX_TRAINING_RATIO * min(both):
             ours, theirs = format_millions(variant.label), format_millions(other.label)
             unequal.append(f"'{variant.label}' {ours} M to '{other.label}' {theirs} M")
     if unequal:
         yield f"number of frames seen in training differs: {join_first(unequal)}"
+
+
+def _flag_missed_budgets(every: LabelledRuns) -> Iterator[str]:
+    """Flag trainings with another compute than `optim.tflop` asks for, since their steps are few."""
+    missed = {
+        label: f"'{label}' {run.training['tflop']:.3g} instead of {budget:g}"
+        for label, run in every
+        if (budget := run.training.get("budget"))
+        and not abs(run.training.get("tflop", math.nan) / budget - 1) <= MAX_BUDGET_ERROR
+    }
+    if missed:
+        yield f"training compute differs from optim.tflop, TFLOP: {join_first(list(missed.values()))}"
 
 
 def _flag_busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:

@@ -119,7 +119,8 @@ class MeasuredRun:
         clip_sources: the source of each clip, if the data has several sources.
         run: the run's folder; None for kept results.
         training: known training costs: `seconds`; `frames`, the total number of frames in all training
-            windows; and `flops` for kept results.
+            windows; `tflop`, the compute with prerequisite runs; `budget`, the compute that `optim.tflop`
+            asks for; and `flops` for kept results.
         code: code digests by file (`compute_code_digests`), joined with different digests of prerequisite
             runs; empty for kept results.
     """
@@ -263,6 +264,8 @@ def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> Meas
     seconds, frames = (manifest.get("seconds") or {}).get("train"), count_training_frames(run)
     training = {"seconds": float(seconds)} if seconds is not None else {}
     training |= {"frames": frames} if frames else {}
+    compute = {"tflop": manifest.get("tflop"), "budget": (run.config.get("optim") or {}).get("tflop")}
+    training |= {name: float(value) for name, value in compute.items() if value is not None}
     costs, code = _read_costs(latency), _read_code_digests(manifest)
     return MeasuredRun(run.id, means, clips, groups, costs, origin, run, sources, training, code)
 

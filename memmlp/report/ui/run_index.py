@@ -91,7 +91,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
         "data_name": _convert_to_text(listed.get("data.name")),
         "device": _convert_to_text(manifest.get("gpu")) or _convert_to_text(manifest.get("device")),
         "prerequisite": _convert_to_text(manifest.get("prerequisite")),
-        "steps": _find_total_steps(manifest.get("kind"), config),
+        "steps": manifest.get("steps") or _find_total_steps(manifest.get("kind"), config),
         "recent": read_recent_entries(run.metrics_path),
         "config": listed,
         "metrics": _read_metrics(run, {key: config[key] for key in USE_GROUPS if key in config}, damage),

@@ -21,7 +21,6 @@ from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
 from memmlp.sweep.controller import READ_INTERVAL, Fleet
 from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
-from memmlp.sweep.progress_table import count_steps
 from memmlp.sweep.search.progress_table import SearchBoard
 from memmlp.sweep.search.search_file import Objective, Value
 from memmlp.sweep.search.study import Study, get_values
@@ -110,7 +109,6 @@ class Director:
         except InputError as error:
             self.study.fail(trial, str(error))
             return
-        trial.set_user_attr("steps", count_steps(started.seeds[0][-1]))
         started.request_seeds(1)
         self.running[trial.number] = started
 
@@ -139,7 +137,7 @@ class Director:
             if failure := self.plan.get_run(task).failure:
                 self.study.fail(one.trial, failure)
                 return True
-        return one.seed_count == 1 and 0 < step < count_steps(last[0]) and self.study.prune(one.trial)
+        return one.seed_count == 1 and 0 < step < runs[0].total_steps and self.study.prune(one.trial)
 
     def _count_usable_workers(self) -> int:
         """Return the number of workers that the running trials can use: one for each unfinished run.
@@ -189,15 +187,15 @@ def read_validations(run: Run) -> list[LogRecord]:
 
 
 def read_objectives(objectives: Sequence[Objective], run: Run) -> list[float]:
-    """Return the value of each objective after a finished run's last step.
+    """Return the value of each objective for a finished run's weights (`Run.kept_validation`).
 
     Raises:
-        InputError: if the log was damaged and does not contain the last validation.
+        InputError: if the log was damaged and does not contain that validation.
     """
-    entries, steps = read_validations(run), run.config["optim"]["steps"]
-    if not entries or entries[-1].step != steps:
-        raise InputError(f"{run.metrics_path}: the validation at step {steps} is missing; run it again")
-    return [objective.value(entries[-1].values) for objective in objectives]
+    kept, step = run.kept_validation, run.manifest.get("best_step") or run.total_steps
+    if kept is None or kept.step != step:
+        raise InputError(f"{run.metrics_path}: the validation at step {step} is missing; run it again")
+    return [objective.value(kept.values) for objective in objectives]
 
 
 def direct_search(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:

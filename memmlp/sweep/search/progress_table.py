@@ -93,7 +93,7 @@ def _describe_runs(trial: FrozenTrial, runs: Sequence[Run]) -> Text:
     done = f"{count} seeds done, " if count else ""
     if current is None:
         return Text(f"{done}waiting")
-    return Text(done + describe_progress(current, trial.user_attrs["steps"]), style="cyan")
+    return Text(done + describe_progress(current), style="cyan")
 
 
 def make_trials_table(search: Search, title: str) -> Table:

@@ -16,6 +16,7 @@ startup: 10                         # the number of random trials before TPE; nu
 seed: 0                             # the sampler's seed
 pruner: median                      # median: stops a trial worse than the median of earlier trials; none
 prune_after: 5                      # the number of finished trials before pruning; null with pruner: none
+tflop: null                         # the compute of each training, TFLOP; null: steps set its length
 storage: null                       # null: a journal in the search's folder; or a storage URL for Optuna
 """
 
@@ -30,7 +31,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import format_value
-from memmlp.common.settings import Rule, matching, one_of
+from memmlp.common.settings import Rule, matching, one_of, positive
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 
 OBJECTIVE_BRANCHES = ("rotation", "position")
@@ -107,6 +108,7 @@ class Search:
     seed: int
     pruner: str
     prune_after: int | None
+    tflop: float | None
     storage: str | None
 
     def list_first_trials(self) -> list[dict[str, Value]]:
@@ -120,6 +122,14 @@ class Search:
             return [dict(zip(keys, values, strict=True)) for values in every]
         first: dict[str, Value] = {one.key: one.first for one in self.space if one.first is not None}
         return [first] if first else []
+
+    @property
+    def budget(self) -> tuple[str, ...]:
+        """The overrides of a fixed compute: its trainings keep their best weights, out of ten validations."""
+        if self.tflop is None:
+            return ()
+        branch = self.objectives[0].terms[0][1].split()[0]
+        return f"optim.tflop={self.tflop}", f"optim.best_by={branch}", "optim.validate_every=0.1"
 
     def overrides(self, values: Mapping[str, Value]) -> tuple[str, ...]:
         """Return a trial's values as overrides of `memmlp train`."""
@@ -139,6 +149,7 @@ def _is_text_list(value: Any) -> bool:
 
 RULES = {
     "name": matching(r"[\w-]{1,64}", "up to 64 letters, digits, - and _"),
+    "tflop": Rule("above 0, or null", lambda value: value is None or positive().allows(value)),
     "storage": Rule("a URL, or null", lambda value: value is None or isinstance(value, str)),
     "objectives": Rule("a list of texts", _is_text_list),
     "base": Rule("a list of texts", _is_text_list),

@@ -368,6 +368,19 @@ def test_variants_that_saw_more_in_training(flags: Callable[..., list[str]], swe
     assert flag.endswith("'by position' 3-6 M to 'full_model' 3 M")
 
 
+def test_trainings_that_missed_their_compute(flags: Callable[..., list[str]]):
+    """With equal budgets, trainings may see unequal numbers of frames."""
+
+    def settings(label: str, _: int) -> dict[str, Any]:
+        frames, tflop = (82, 5.2) if label == "full_model" else (41, 4.7)
+        optim = {"steps": 2000, "batch": 32, "tflop": 5}
+        return {"config": {"optim": optim, "model": {"frames": frames}}, "origin": {"tflop": tflop}}
+
+    missed = "'no | memory' 4.7 instead of 5, 'by position' 4.7 instead of 5"
+    assert flags("TFLOP", settings) == [f"training compute differs from optim.tflop, TFLOP: {missed}"]
+    assert flags("frames seen", settings) == []
+
+
 def test_offline_networks_in_every_format(sweep: Sweep, tmp_path: Path):
     late = {"by position": {"offline": True}}
     runs = {

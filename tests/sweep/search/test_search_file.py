@@ -21,6 +21,7 @@ GOOD: dict[str, Any] = {
     "seed": 0,
     "pruner": "median",
     "prune_after": 2,
+    "tflop": None,
     "storage": None,
 }
 
@@ -117,6 +118,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"pruner": "hyperband"}, "search.pruner=hyperband"),
     ({"name": "a/b"}, "search.name=a/b"),
     ({"name": "a" * 65}, "search.name="),
+    ({"tflop": 0}, "search.tflop=0"),
     ({"storage": 5}, "search.storage=5"),
     ({"nonsense": 3}, "search.nonsense: no such key"),
 ]
