@@ -18,7 +18,7 @@ from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import Bvh, read_bvh
 from memmlp.motion.formats.recording import END
-from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap
+from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap, load_skeleton
 
 REST = make_builtin_rest_joints()
 # Joint, parent, offset; a * before an end site's joint, which comes with the offset only.
@@ -38,15 +38,19 @@ LeftFoot LeftLeg 2.53 -6.96 0; LeftToeBase LeftFoot 0.16 -0.44 1.95; *LeftToeBas
 -6.7 0; RightToeBase RightFoot -0.21 -0.57 2.02; *RightToeBase 0 0 1; LowerBack Hips 0 0 0; Spine
 LowerBack 0 2.24 0; Spine1 Spine 0 2.19 -0.2; Neck Spine1 0 0 0; Neck1 Neck -0.12 1.43 0.28; Head Neck1
 0.18 1.46 -0.33; *Head 0 1.5 0; LeftShoulder Spine1 0 0 0; LeftArm LeftShoulder 3.28 0.86 0.05;
-LeftForeArm LeftArm 4.97 0 0; LeftHand LeftForeArm 3.36 0 0; *LeftHand 0.8 0 0; RightShoulder Spine1 0 0
-0; RightArm RightShoulder -3.24 1.02 0.35; RightForeArm RightArm -5.22 0 0; RightHand RightForeArm -3.37
-0 0; *RightHand -0.6 0 0
+LeftForeArm LeftArm 4.97 0 0; LeftHand LeftForeArm 2.24 0 0; LeftFingerBase
+LeftHand 1.12 0 0; *LeftFingerBase 0.8 0 0; RightShoulder Spine1 0 0
+0; RightArm RightShoulder -3.24 1.02 0.35; RightForeArm RightArm -5.22 0 0; RightHand RightForeArm -2.25
+0 0; RightFingerBase RightHand -1.12 0 0; *RightFingerBase -0.6 0 0
 """
 TREES = {"cmu_daz": DAZ, "cmu_motionbuilder": MOTIONBUILDER}
-FOLDED = ("lButtock", "rButtock", "LHipJoint", "RHipJoint", "Neck1")  # unmapped, between mapped ones
+FOLDED = (  # unmapped, between mapped ones
+    "lButtock", "rButtock", "LHipJoint", "RHipJoint", "Neck1", "LeftHand", "RightHand",
+)  # fmt: skip
 POSITIONS = ("Xposition", "Yposition", "Zposition")
 ZXY = ("Zrotation", "Xrotation", "Yrotation")
 ORDERS = [tuple(axis + "rotation" for axis in order) for order in itertools.permutations("XYZ")]
+REST_ORDERS = {"cmu_daz": ZXY, "cmu_motionbuilder": ("Zrotation", "Yrotation", "Xrotation")}
 
 
 @dataclass
@@ -91,7 +95,10 @@ class Sample:
 
 
 def tree(skeleton: str, seed: int = 3) -> Sample:
-    """Make the skeleton of `TREES`, without motion; the rotation channels' order is drawn for each joint."""
+    """Make the skeleton of `TREES`, without motion.
+
+    The rotation channels' order is drawn for each joint, unless the map's `rest` has values of the joint.
+    """
     random = np.random.default_rng(seed)
     names, parents, offsets, ends = [], [], [], []
     for entry in TREES[skeleton].replace("\n", " ").split(";"):
@@ -102,7 +109,8 @@ def tree(skeleton: str, seed: int = 3) -> Sample:
             names.append(name)
             parents.append(-1 if rest[0] == "-" else names.index(rest[0]))
             offsets.append([float(word) for word in rest[1:]])
-    channels = [ORDERS[random.integers(len(ORDERS))] for _ in names]
+    fixed = dict.fromkeys(load_skeleton(skeleton).rest or (), REST_ORDERS[skeleton])
+    channels = [fixed.get(name, ORDERS[random.integers(len(ORDERS))]) for name in names]
     channels[0] = (*POSITIONS, *channels[0])
     return Sample(names, parents, offsets, ends, channels, np.empty((0, sum(map(len, channels)))))
 

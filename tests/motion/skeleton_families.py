@@ -19,7 +19,10 @@ HANDS = "; ".join(
     for side, sign in (("Left", ""), ("Right", "-"))
     for part in (FINGERS, THUMB, TIPS)
 )
-MORE = {"mixamo": "HeadTop_End Head 0 19 6; *HeadTop_End 0 0 0; LeftEye Head 3 8 9; " + HANDS}
+MORE = {
+    "mixamo": "HeadTop_End Head 0 19 6; *HeadTop_End 0 0 0; LeftEye Head 3 8 9; " + HANDS,
+    "iclone": "FacialBone Head 0 0 0; JawRoot FacialBone 0 2 3; *JawRoot 0 1 2",
+}
 """Nodes that a map leaves out: node, parent, offset in centimetres; * for an end site."""
 
 

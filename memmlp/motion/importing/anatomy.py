@@ -35,7 +35,7 @@ LEVEL = 30.0  # degrees: maximum angle between the hip line and the horizontal i
 ARMS = 100.0  # degrees: maximum angle between an arm's bone and its T-pose direction in a zero pose
 SHORTEST = 1e-3  # metres
 BENT = 15.0  # degrees: minimum bend of a knee or elbow that shows its axis in a stance
-HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # minimum mean sine of the bend, and minimum agreement of its axes
+HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # minimum mean and range of the bend's sine, and agreement of its axes
 
 
 class Segment(NamedTuple):
@@ -241,5 +241,9 @@ def find_hinge_axis(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.
     )
     bends = np.einsum("nij,ni->nj", upper, np.cross(*bones))
     total, sizes = bends.sum(0), np.linalg.norm(bends, axis=-1)
-    is_clear = sizes.mean() > HINGE_BEND and np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
+    is_clear = (
+        sizes.mean() > HINGE_BEND
+        and np.ptp(sizes) > HINGE_BEND
+        and np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
+    )
     return normalize_vectors(total) if is_clear else None

@@ -18,6 +18,7 @@ decide.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,6 +60,7 @@ UPRIGHT_SHARE = 0.5  # minimum mean component of the direction from pelvis to he
 POSITION_LIMIT = 1e4  # metres, as in `read_clip`
 HIP_LINE = Segment(HIPS[1], HIPS[0])
 STRAIGHTEST = "the straightest frame"
+TWIST = 1.0  # degrees: maximum twist of a limb that counts as untwisted
 TRIED = 500  # maximum number of evenly spaced frames in the search for a stance
 
 CONTACT = 0.02  # metres: height of a standing toe joint above the floor, on the built-in body
@@ -132,14 +134,15 @@ class Stance:
         positions: positions (22, 3) of the mapped joints' nodes.
         nodes: positions (nodes, 3) of all nodes in the file.
         source: a description of the pose in the file.
-        straight: whether the limbs have zero rotations, and so are assumed to be without twist.
+        untwisted: the hips and shoulders (`HINGES`) of limbs that do not turn about their bones from a zero
+            pose that stands, and so are assumed to be without twist.
     """
 
     rotations: np.ndarray
     positions: np.ndarray
     nodes: np.ndarray
     source: str
-    straight: bool
+    untwisted: frozenset[int]
 
 
 @dataclass(frozen=True)
@@ -165,26 +168,31 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
     """Find the stance of a file: the rest pose in the map, else the zero pose, else the straightest frame.
 
     Raises:
-        InputError: if the file has no stance, or the left and right of the stance contradict each other.
+        InputError: if the file has no stance or no such frame, or if left and right contradict each other.
     """
     upright, positions, path = skeleton.upright, motion.positions, recording.path
+    stands = (why := anatomy.find_stance_fault(motion.zero)) is None
 
     def stance(rotations: np.ndarray, pose: np.ndarray, nodes: np.ndarray, source: str) -> Stance:
-        if (why := anatomy.find_side_fault(pose, motion.mapped)) is not None:
-            raise InputError(f"{path}: in {source}, {why}; check left and right in the map and the up axis")
+        if (fault := anatomy.find_side_fault(pose, motion.mapped)) is not None:
+            raise InputError(f"{path}: in {source}, {fault}; check left and right in the map and the up axis")
         turn = anatomy.find_facing_turn(pose)
         nodes = skeleton.unit * nodes @ upright.T @ turn.T
-        straight = np.allclose(rotations[[*LIMBS]], np.eye(3))
-        return Stance(turn @ rotations, pose @ turn.T, nodes, source, straight)
+        untwisted = frozenset(
+            joint for joint in HINGES if stands and _is_untwisted(joint, rotations, motion.zero)
+        )
+        return Stance(turn @ rotations, pose @ turn.T, nodes, source, untwisted)
 
     if skeleton.rest is not None:
-        rotations, nodes = recording.compute_pose(skeleton.rest)
+        source = f"frame {skeleton.rest}" if isinstance(skeleton.rest, int) else "the map's rest pose"
+        rotations, nodes = _compute_rest(recording, skeleton.rest)
         pose = skeleton.unit * nodes[motion.nodes] @ upright.T
-        if (why := anatomy.find_stance_fault(pose)) is not None:
-            raise InputError(f"{path}: rest in skeleton {skeleton.name} must be an upright stance, but {why}")
-        return stance(upright @ rotations[motion.nodes] @ upright.T, pose, nodes, "the map's rest pose")
-    why = anatomy.find_stance_fault(motion.zero)
-    if why is None:
+        if (fault := anatomy.find_stance_fault(pose)) is not None:
+            raise InputError(
+                f"{path}: rest in skeleton {skeleton.name} ({source}) must be an upright stance, but {fault}"
+            )
+        return stance(upright @ rotations[motion.nodes] @ upright.T, pose, nodes, source)
+    if stands:
         identities = np.tile(np.eye(3), (len(motion.zero), 1, 1))
         zero = stance(identities, motion.zero, recording.compute_zero_pose(), "the zero pose")
         if not anatomy.has_raised_arm(zero.positions):
@@ -205,6 +213,29 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
     return stance(motion.rotations[frame], positions[frame], nodes, f"{STRAIGHTEST} {frame}")
 
 
+def _is_untwisted(joint: int, rotations: np.ndarray, zero: np.ndarray) -> bool:
+    """Return whether neither bone of a limb is turned about its own direction, relative to the zero pose."""
+    middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
+    bones = anatomy.normalize_vectors(np.diff(zero[[joint, middle, end]], axis=0))
+    turns = [rotations[joint], rotations[joint].T @ rotations[middle]]
+    twists = (Rotation.from_matrix(np.array(turns)).as_rotvec() * bones).sum(-1)
+    return bool(np.abs(np.degrees(twists)).max() < TWIST)
+
+
+def _compute_rest(
+    recording: Recording, rest: Mapping[str, Sequence[float]] | int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of a map's rest pose."""
+    if not isinstance(rest, int):
+        return recording.compute_pose(rest)
+    if rest >= len(recording):
+        raise InputError(
+            f"{recording.path}: rest: frame {rest}: must be one of frames 0 to {len(recording) - 1}"
+        )
+    rotations, positions = recording.compute_kinematics()
+    return rotations[rest], positions[rest] - positions[rest, 0]
+
+
 def fit_skeleton(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Retargeting:
     """Fit a recording's skeleton to a body's rest joints (22, 3), metres.
 
@@ -216,8 +247,7 @@ def fit_skeleton(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) 
     motion = pick_joints(recording, skeleton)
     stance = find_stance(recording, skeleton, motion)
     turned = anatomy.compute_orientations(stance.positions, motion.mapped, rest)
-    if not stance.straight:
-        _align_bend_axes(turned, stance, motion, rest)
+    _align_bend_axes(turned, stance, motion, rest)
     corrections = stance.rotations.swapaxes(-1, -2) @ turned
     scale = float(_measure_legs(rest) / np.median(_measure_legs(motion.positions)))
     return Retargeting(skeleton, motion, stance, corrections, scale)
@@ -269,6 +299,8 @@ def _align_bend_axes(rotations: np.ndarray, stance: Stance, motion: MappedMotion
     The axes come from the stance if the limb is bent there, otherwise from the motion.
     """
     for joint, rest_axis in HINGES.items():
+        if joint in stance.untwisted:
+            continue
         axis = anatomy.find_bend_axis(stance.positions, joint)
         if axis is None:
             local_axis = anatomy.find_hinge_axis(motion.rotations[:, joint], motion.positions, joint)

@@ -102,6 +102,7 @@ def compare_with_recording(clip: Clip, motion: MappedMotion, rest: np.ndarray, s
     impossible = explain_implausibility(clip)
     faults = (
         *_find_map_faults(mm, degrees, expected, mapped),
+        *_find_hip_faults(motion),
         *_find_turn_faults(rotations, positions),
         *_find_length_faults(expected, rest),
         *([impossible] if impossible else find_faults(clip)),
@@ -164,6 +165,17 @@ def _find_map_faults(
             frame = int(np.abs(lengths - np.median(lengths)).argmax())
             change = f"{segment} changes its length by {1000 * np.ptp(lengths):.0f} mm in the file"
             yield f"{change} (most in frame {frame}), so an unmapped joint turns, or the map is wrong"
+
+
+def _find_hip_faults(motion: MappedMotion) -> Iterator[str]:
+    for hip in HIPS:
+        offset = motion.positions[:, hip] - motion.positions[:, 0]
+        local = np.einsum("nij,ni->nj", motion.rotations[:, 0], offset)
+        moved = np.linalg.norm(local - (motion.zero[hip] - motion.zero[0]), axis=-1)
+        if moved.max() > STRETCH:
+            far = f"{JOINTS[hip]} moves relative to the pelvis by {1000 * moved.max():.0f} mm"
+            where = f"in frame {moved.argmax()}"
+            yield f"{far} {where}, so a joint between them turns, or the file is from another program"
 
 
 def _find_turn_faults(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str]:

@@ -6,6 +6,7 @@ the function to `READERS`.
 
 from __future__ import annotations
 
+import csv
 import hashlib
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -14,7 +15,8 @@ from typing import NamedTuple
 
 import yaml
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, describe_read_error
+from memmlp.motion.clip import FRAME_RATE_RANGE
 from memmlp.motion.formats.asf_amc import read_amc
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.recording import Recording
@@ -22,6 +24,8 @@ from memmlp.motion.formats.recording import Recording
 READERS: dict[str, Callable[[Path], Recording]] = {".bvh": read_bvh, ".amc": read_amc}
 EXPECTED = f"expected a {' or '.join(READERS)} file, or a folder with such files"
 HEADER = "the header's"
+INDEX = "*index.csv"
+COLUMNS = "Subject", "Trial #", "framerate"  # of the CMU database's index
 DIGITS = 16  # number of digits of a file's digest in known_rates.yaml
 
 
@@ -67,12 +71,18 @@ def read_recording(path: Path) -> Recording:
 
 
 def find_rate(recording: Recording, relative: Path, user_rates: Mapping[str, float]) -> Rate:
-    """Find the true frame rate: the user's rate, else a known correction, else the header's, else 120 Hz.
+    """Find the true frame rate: the user's, a known file's, the index's, the header's, or else 120 Hz.
+
+    An index is a CSV file `*index.csv` in the file's folder, or in one above it up to the imported folder. It
+    has the columns of the CMU database's index; its row of a file is found by the name `SUBJECT_TRIAL`.
 
     Args:
         recording: the recording.
         relative: the file's path below the imported folder.
         user_rates: folder below the imported folder ("" for all) -> rate, Hz.
+
+    Raises:
+        InputError: if an index is damaged.
     """
     for folder in relative.parents:
         if (key := make_folder_key(folder)) in user_rates:
@@ -81,6 +91,10 @@ def find_rate(recording: Recording, relative: Path, user_rates: Mapping[str, flo
     known = _load_known_rates().get(hashlib.sha256(plain).hexdigest()[:DIGITS])
     if known is not None:
         return Rate(known, "the known true rate of this file")
+    for folder in recording.path.parents[: len(relative.parents)]:
+        for path in sorted(folder.glob(INDEX)):
+            if (rate := _read_index(path).get(recording.path.stem)) is not None:
+                return Rate(rate, f"the rate in {path.name}")
     if recording.fps is None:
         return DATABASES
     return Rate(recording.fps, HEADER)
@@ -89,6 +103,28 @@ def find_rate(recording: Recording, relative: Path, user_rates: Mapping[str, flo
 def make_folder_key(folder: Path) -> str:
     """Return a folder's name in `--fps`, relative to the imported folder; "" for the imported folder."""
     return "" if folder == Path() else folder.as_posix()
+
+
+@cache
+def _read_index(path: Path) -> dict[str, float]:
+    """Read an index: name of a file, such as `05_01` -> its rate, Hz."""
+    rates: dict[str, float] = {}
+    low, high = FRAME_RATE_RANGE
+    try:
+        with open(path, encoding="utf-8-sig", newline="") as file:
+            for row in (rows := csv.DictReader(file)):
+                subject, trial, rate = (row[column] for column in COLUMNS)
+                rates[f"{int(subject):02}_{int(trial):02}"] = float(rate)
+                if not low <= float(rate) <= high:
+                    raise ValueError
+    except KeyError as error:
+        raise InputError(f"{path}: has no column {error}; must have {', '.join(COLUMNS)}") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: {describe_read_error(error)}; expected a CSV file") from None
+    except (TypeError, ValueError):
+        expected = f"numbers in {', '.join(COLUMNS)}, and a rate of {low:g} to {high:g} Hz"
+        raise InputError(f"{path}: line {rows.line_num}: must have {expected}") from None
+    return rates
 
 
 @cache

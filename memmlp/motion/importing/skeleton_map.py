@@ -39,8 +39,8 @@ class SkeletonMap:
         unit: the file's unit in metres; None finds it from the length of the legs.
         up: the file's up axis, `y` or `z`; None finds it from the motion.
         calibration_frame: whether frame 0 is a calibration pose instead of motion.
-        rest: a stance, as joint -> rotation values in degrees, like in a frame of the file. None uses the
-            zero pose if the person stands in it, else the straightest frame.
+        rest: a stance, as joint -> rotation values in degrees, like in a frame of the file, or the index of a
+            frame. None uses the zero pose if the person stands in it, else the straightest frame.
     """
 
     name: str
@@ -48,7 +48,7 @@ class SkeletonMap:
     unit: float | None = None
     up: str | None = None
     calibration_frame: bool = False
-    rest: dict[str, list[float]] | None = None
+    rest: dict[str, list[float]] | int | None = None
 
     def replace_up_axis(self, up: str | None) -> SkeletonMap:
         """Return a copy with a different up axis, `y` or `z`; None changes nothing."""
@@ -125,12 +125,12 @@ def _load_shipped(folder: Path) -> tuple[SkeletonMap, ...]:
 
 def _respell(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
     """Adapt a map to the file's spelling of nodes; None if the file lacks a node."""
-    rest = skeleton.rest or {}
+    rest = skeleton.rest if isinstance(skeleton.rest, dict) else {}
     nodes = find_nodes(recording.nodes, sorted({*skeleton.joints.values(), *rest}))
     if nodes is None:
         return None
     joints = {joint: nodes[node] for joint, node in skeleton.joints.items()}
-    return replace(skeleton, joints=joints, rest={nodes[node]: rest[node] for node in rest} or None)
+    return replace(skeleton, joints=joints, rest={nodes[node]: rest[node] for node in rest} or skeleton.rest)
 
 
 # Names of nodes
@@ -139,17 +139,25 @@ def _respell(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
 def strip_namespace(nodes: Sequence[str]) -> list[str]:
     """Remove common prefixes of node names, such as `mixamorig:`, `Character1_` or `m_avg_`.
 
-    A prefix with a colon is always removed. If the resulting names are not unique, the names stay unchanged.
+    A prefix with a colon is always removed. The root may lack the others' prefix. If the resulting names are
+    not unique, the names stay unchanged.
     """
     plain = [re.sub(r".*[:|]", "", node) for node in nodes]
-    letters = zip(*(name.removesuffix(END) for name in plain), strict=False)
-    shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, letters)]
-    for length in range(len(shared), 0, -1):  # prefixes end at a separator or before a capital letter
-        capital = shared[length - 1].islower() and all(name[length : length + 1].isupper() for name in plain)
-        if SEPARATORS.fullmatch(shared[length - 1]) or capital:
-            plain = [name[length:] for name in plain]
-            break
+    for names in (plain, plain[1:]):
+        prefix = _find_prefix(names) if len(names) > 1 else ""
+        plain = [name.removeprefix(prefix) for name in plain]
     return plain if len(set(plain)) == len(plain) and all(plain) else list(nodes)
+
+
+def _find_prefix(names: Sequence[str]) -> str:
+    """Find the longest common prefix that ends at a separator or before a capital letter."""
+    letters = zip(*(name.removesuffix(END) for name in names), strict=False)
+    shared = "".join(each[0] for each in takewhile(lambda each: len(set(each)) == 1, letters))
+    for length in range(len(shared), 0, -1):
+        capital = shared[length - 1].islower() and all(name[length : length + 1].isupper() for name in names)
+        if SEPARATORS.fullmatch(shared[length - 1]) or capital:
+            return shared[:length]
+    return ""
 
 
 def find_nodes(nodes: Sequence[str], names: Sequence[str]) -> dict[str, str] | None:
@@ -208,7 +216,10 @@ def _parse_map(path: Path, content: object) -> SkeletonMap:
     )
     require(values.get("up") in ("y", "z", None), "up", "y, z or auto")
     require(isinstance(values.get("calibration_frame", False), bool), "calibration_frame", "true or false")
-    require(_is_rest(values.get("rest")), "rest", "auto, or JOINT: [degrees, degrees, degrees]")
+    if frame := re.fullmatch(r"frame (\d{1,6})", str(values.get("rest"))):
+        values["rest"] = int(frame[1])
+    elif not _is_rest(values.get("rest")):
+        require(False, "rest", "auto, frame N, or JOINT: [degrees, degrees, degrees]")
     require(isinstance(joints, dict), "joints", f"a mapping of {', '.join(JOINTS)} to the file's joints")
     for joint, node in joints.items():
         is_valid = joint in JOINTS and _is_text(node)

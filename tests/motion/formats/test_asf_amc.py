@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from asf_samples import DOFS, amc_text, asf_text, movement, plain_positions, write_take
+from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import make_builtin_rest_joints
+from memmlp.motion.body import JOINTS, make_builtin_rest_joints
 from memmlp.motion.formats.asf_amc import read_amc
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import compute_clip_kinematics
@@ -50,17 +51,19 @@ def test_an_import_has_the_files_segments(tmp_path: Path):
     assert_imported(tmp_path / "in", tmp_path / "out")
 
 
-def test_a_head_that_looks_ahead_is_level(tmp_path: Path):
-    """In the zero pose the head leans back."""
+def test_head_and_soles_of_a_person_who_stands_are_level(tmp_path: Path):
+    """In the zero pose the head leans back, and the legs are spread by 20 degrees together with the feet."""
     values = np.zeros((2, 62))
     values[:, 1] = 17.0
     columns = [name for name, dofs in DOFS.items() for _ in dofs]
     values[:, columns.index("head")] = 16.0
+    values[:, columns.index("lfemur") + 2], values[:, columns.index("rfemur") + 2] = -20.0, 20.0
     write_take(tmp_path / "05", values)
     import_folder(tmp_path / "05", tmp_path / "out")
     clip = read_clip(tmp_path / "out" / "05_01.npz", "05_01")
     rotations, _ = compute_clip_kinematics(clip, make_builtin_rest_joints())
     assert np.degrees(np.arcsin(rotations[0, 15, 2, 2])) == pytest.approx(0, abs=0.1)
+    assert np.degrees(np.arcsin(rotations[0, [7, 8], 2, 0])) == pytest.approx([0, 0], abs=2.0)
 
 
 def test_joints_are_where_plain_kinematics_puts_them(tmp_path: Path):
@@ -205,6 +208,24 @@ def test_the_databases_have_the_takes_and_cuts_of_their_readmes(database: Path, 
             (tmp_path / "in" / person.name).mkdir(parents=True, exist_ok=True)
             (tmp_path / "in" / person.name / file.name).symlink_to(file)
     assert_imported(tmp_path / "in", tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_two_forms_of_a_take_are_one_body(database: Path, tmp_path: Path):
+    """ASF/AMC and the MotionBuilder conversion, which has no length between thorax and neck."""
+    archive = DATA / "cmu-bvh" / "cmu-motionbuilder.tar.xz"
+    take = next(database.rglob("05_06.amc"), None)
+    if not archive.is_file() or take is None:
+        pytest.skip("needs subject 05 of CMU's database in both forms")
+    with tarfile.open(archive) as file:
+        file.extract("cmu-motionbuilder/05/05_06.bvh", tmp_path, filter="data")
+    import_folder(tmp_path / "cmu-motionbuilder" / "05" / "05_06.bvh", tmp_path / "one")
+    import_folder(take, tmp_path / "other")
+    one, other = (read_clip(tmp_path / side / "05_06.npz", "clip") for side in ("one", "other"))
+    one_at, other_at = (compute_clip_kinematics(c, make_builtin_rest_joints())[0] for c in (one, other))
+    turns = Rotation.from_matrix((one_at.swapaxes(-1, -2) @ other_at).reshape(-1, 3, 3))
+    angles = np.degrees(turns.magnitude()).reshape(len(one), -1)
+    assert angles[:, [joint for joint in range(22) if JOINTS[joint] != "spine3"]].max() < 3
 
 
 def first_frame(take: Path) -> int:

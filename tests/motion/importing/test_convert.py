@@ -114,7 +114,7 @@ def test_any_zero_pose_is_as_in_the_file(tmp_path: Path, walk: Clip, skeleton: s
 # Units and up axes: told, found, or refused
 
 
-DAZ = replace(load_skeleton("cmu_daz"), calibration_frame=False)
+DAZ = replace(load_skeleton("cmu_daz"), calibration_frame=False, rest=None)
 FOUND = replace(DAZ, unit=None, up=None)
 
 
@@ -291,7 +291,7 @@ def test_a_standing_person_stands(tmp_path: Path) -> None:
     assert rotations[JOINT["pelvis"]] == pytest.approx(np.pi / 2, abs=0.15)
     assert np.degrees(rotations[1:]).max() < 35
     wrists = [JOINT["left_wrist"], JOINT["right_wrist"]]
-    np.testing.assert_allclose(rotations[wrists], 0, atol=1e-9)
+    np.testing.assert_allclose(np.degrees(rotations[wrists]), 17.4, atol=0.1)  # the hands are straight
 
 
 def test_translation_is_scaled_by_the_legs(tmp_path: Path) -> None:
@@ -367,12 +367,27 @@ def test_a_zero_pose_serves_if_it_stands(tmp_path: Path, walk: Clip) -> None:
     """Whichever way it faces, it is turned to face +Z."""
     lies = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("x", 90, degrees=True)))
     assert lies.source.startswith(STRAIGHTEST)
-    assert not lies.straight
+    assert not lies.untwisted
     stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("y", -37, degrees=True)))
-    assert (stance.source, stance.straight) == ("the zero pose", True)
+    assert (stance.source, stance.untwisted) == ("the zero pose", {1, 2, 16, 17})
     left = stance.positions[1] - stance.positions[2]
     np.testing.assert_allclose(left / np.linalg.norm(left), [1, 0, 0], atol=1e-6)
     assert (stance.positions[10] - stance.positions[7])[2] > 0
+
+
+def test_a_frame_of_the_file_serves_as_rest(tmp_path: Path, walk: Clip) -> None:
+    """A T-pose in frame 0, in a file whose zero pose is not a stance."""
+    chosen = replace(DAZ, calibration_frame=True, rest=0)
+    bvh = read_bvh(write(tmp_path, performed(chosen, walk, turns=random_turns(own_tree(DAZ), 1)).text()))
+    done = convert_recording(bvh, chosen, REST, name="clip", fps=120.0, floor=NONE)
+    assert (done.fitted.stance.source, done.fidelity.faults) == ("frame 0", ())
+    expected = to_clip(read_bvh(write(tmp_path, performed(DAZ, walk).text(), "zero.bvh")), DAZ)
+    joints = [JOINT[name] for name in ("pelvis", "head", "left_collar", "spine2")]
+    np.testing.assert_allclose(done.clip.poses[:, joints], expected.poses[:, joints], atol=1e-5)
+    with refuse(tmp_path / "clip.bvh", "rest: frame 999999: must be one of frames 0 to"):
+        find_stance(bvh, replace(chosen, rest=999999), pick_joints(bvh, chosen))
+    with refuse(tmp_path / "clip.bvh", "rest in skeleton cmu_daz (frame 3) must be an upright stance"):
+        found(tmp_path, lying(walk, "z"), replace(DAZ, rest=3))
 
 
 def test_who_never_stands_is_refused(tmp_path: Path, walk: Clip) -> None:

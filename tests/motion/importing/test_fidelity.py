@@ -138,6 +138,30 @@ def test_swapped_sides_without_toes_are_said(tmp_path: Path) -> None:
     assert any(fault.startswith("the knees bend backwards") for fault in said)
 
 
+def test_hips_that_turn_below_the_pelvis_are_said(tmp_path: Path) -> None:
+    """As where another program turns the joint above the hip, which its own files never turn."""
+    name, file = "cmu_motionbuilder", tree("cmu_motionbuilder")
+    written = performed(load_skeleton(name), synthesize_clip("walking", 1, seconds=1.0), sample=file)
+    column = 3 + 3 * file.names.index("LHipJoint")
+    for degrees in (0.0, 20.0):
+        written.values[:, column : column + 3] = [degrees, 0, 0]
+        faults = "; ".join(converted(write(tmp_path, written.text()), load_skeleton(name)).fidelity.faults)
+        assert ("left_hip moves relative to the pelvis by" in faults) == bool(degrees)
+
+
+def test_limbs_that_do_not_bend_have_no_axis(tmp_path: Path) -> None:
+    """Knees that lean outward on the skeleton itself, in a person who hardly moves."""
+    chosen = load_skeleton("fairmotion")
+    file, clip = own_tree(chosen), synthesize_clip("walking", 1, seconds=1.0)
+    for knee, side in (("lknee", 1), ("rknee", -1)):
+        file.offsets[file.names.index(knee)][0] += 8.0 * side
+        file.offsets[file.names.index(knee.replace("knee", "ankle"))][0] -= 8.0 * side
+    upright = np.eye(22)[0][:, None] * [np.pi / 2, 0, 0]
+    still = replace(clip, poses=np.broadcast_to(upright, clip.poses.shape))
+    faults = converted(write(tmp_path, performed(chosen, still, sample=file).text()), chosen).fidelity.faults
+    assert not any("bends about" in fault for fault in faults)
+
+
 def test_a_small_unit_is_said(tmp_path: Path) -> None:
     said = faults(tmp_path, DAZ, replace(DAZ, unit=0.0045))
     assert said == ("the legs are 0.34 m long, so the unit may be wrong",)

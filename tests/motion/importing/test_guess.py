@@ -41,7 +41,7 @@ def test_words():
 def test_the_shipped_map_is_guessed_and_written(tmp_path: Path, name: str):
     bvh = walks(tmp_path, name)
     proposed = guess_map(bvh, "on: 1")
-    assert proposed.skeleton.joints == load_skeleton(name).joints
+    assert proposed.skeleton.joints == load_skeleton(name).joints | WRISTS.get(name, {})
     assert not proposed.missing
     write_map(tmp_path / "mine.yaml", format_yaml(proposed, bvh))
     loaded = load_skeleton(str(tmp_path / "mine.yaml"))
@@ -50,14 +50,15 @@ def test_the_shipped_map_is_guessed_and_written(tmp_path: Path, name: str):
     assert find_skeleton(bvh, loaded).joints == loaded.joints
 
 
+WRISTS = {"cmu_motionbuilder": {"left_wrist": "LeftHand", "right_wrist": "RightHand"}}  # by their names
 HDM = {  # names of joints in ASF files, as in HDM05 and CMU's database
     "Hips": "root", "LHipJoint": "lhipjoint", "LeftUpLeg": "lfemur", "LeftLeg": "ltibia", "LeftFoot": "lfoot",
     "LeftToeBase": "ltoes", "RHipJoint": "rhipjoint", "RightUpLeg": "rfemur", "RightLeg": "rtibia",
     "RightFoot": "rfoot", "RightToeBase": "rtoes", "LowerBack": "lowerback", "Spine": "upperback",
     "Spine1": "thorax", "Neck": "lowerneck", "Neck1": "upperneck", "Head": "head",
-    "LeftShoulder": "lclavicle", "LeftArm": "lhumerus", "LeftForeArm": "lradius", "LeftHand": "lhand",
-    "RightShoulder": "rclavicle",
-    "RightArm": "rhumerus", "RightForeArm": "rradius", "RightHand": "rhand",
+    "LeftShoulder": "lclavicle", "LeftArm": "lhumerus", "LeftForeArm": "lradius", "LeftHand": "lwrist",
+    "LeftFingerBase": "lhand", "RightFingerBase": "rhand", "RightShoulder": "rclavicle",
+    "RightArm": "rhumerus", "RightForeArm": "rradius", "RightHand": "rwrist",
 }  # fmt: skip
 VRM = {  # humanoid bones of VRM files
     "Hips": "hips", "LeftUpLeg": "leftUpperLeg", "LeftLeg": "leftLowerLeg", "LeftFoot": "leftFoot",
@@ -74,7 +75,8 @@ VRM = {  # humanoid bones of VRM files
 def test_names_of_other_programs_are_known(tmp_path: Path, family: str, names: dict[str, str]):
     bvh = renamed(walks(tmp_path, family), names)
     proposed = guess_map(bvh, "mine")
-    expected = {joint: names[node] for joint, node in load_skeleton(family).joints.items()}
+    nodes = load_skeleton(family).joints | WRISTS.get(family, {})
+    expected = {joint: names[node] for joint, node in nodes.items()}
     assert proposed.skeleton.joints == expected
 
 
@@ -83,6 +85,14 @@ def test_a_proposed_map_imports(tmp_path: Path):
     done = convert_with_guess(bvh, guess_map(bvh, "mine"))
     assert "straightest" in done.fitted.stance.source
     assert done.fidelity.faults == ()
+
+
+def test_a_prefix_that_the_root_lacks_does_not_hide_the_head(tmp_path: Path):
+    bvh = walks(tmp_path, "iclone")
+    root, *others = joints(bvh)
+    bvh = renamed(bvh, {root: "RL_BoneRoot"} | {joint: f"CC_Base_{joint}" for joint in others})
+    proposed = guess_map(bvh, "mine")
+    assert (proposed.skeleton.joints["head"], proposed.missing) == ("CC_Base_Head", ())
 
 
 def test_a_joint_without_a_known_name_is_left_to_the_user(tmp_path: Path):

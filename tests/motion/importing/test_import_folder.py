@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from bvh_samples import own_tree, performed, person, random_turns, refuse, tree, write
 from scipy.spatial.transform import Rotation
 
@@ -208,9 +209,10 @@ def test_a_calibration_pose_that_the_map_keeps_is_noted(walks: Path, tmp_path: P
 
 
 def test_several_up_axes_and_stances_of_one_skeleton_are_noted(tmp_path: Path) -> None:
-    chosen = replace(load_skeleton("cmu_daz"), up=None)
+    chosen = replace(load_skeleton("cmu_daz"), up=None, rest=None)
     walk, path = synthesize_clip("walking", 1, seconds=2.0), tmp_path / "auto.yaml"
-    path.write_text((SKELETONS / "cmu_daz.yaml").read_text().replace("up: y", "up: auto"))
+    content = yaml.safe_load((SKELETONS / "cmu_daz.yaml").read_text()) | {"up": "auto", "rest": "auto"}
+    path.write_text(yaml.safe_dump(content))
     turns = random_turns(own_tree(chosen), 1)
     for name, up in (("a", "y"), ("b", "z"), ("c", "y")):
         text = performed(replace(chosen, up=up), walk, turns=turns).text()

@@ -31,6 +31,26 @@ def test_the_header_is_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert find_rate(replace(recording, fps=None), relative, {"": 60}).fps == 60
 
 
+def test_an_index_beside_the_data_has_the_rates(tmp_path: Path) -> None:
+    path = write(tmp_path, person("cmu_daz", 3, 0).text(), "60/60_12.bvh")
+    other = write(tmp_path, person("cmu_daz", 3, 0).text(), "60/60_13.bvh")
+    header = "Subject,Trial #,Motion Description,framerate\n"
+    index = write(tmp_path, header + '60,12,"salsa, slow",60\n', "cmu-index.csv")
+    relative = path.relative_to(tmp_path)
+    assert find_rate(read_bvh(path), relative, {}) == (60, "the rate in cmu-index.csv")
+    assert find_rate(read_bvh(path), relative, {"60": 30}).fps == 30
+    assert find_rate(read_bvh(path), Path(path.name), {}).fps == 120  # the index is outside of the import
+    assert find_rate(read_bvh(other), other.relative_to(tmp_path), {}).fps == 120
+    for text, said in (
+        ("Subject,framerate\n60,60\n", "has no column 'Trial #'"),
+        (header + "60,12,a,0\n", "line 2"),
+    ):
+        broken = write(tmp_path / said, person("cmu_daz", 3, 0).text(), "60_12.bvh")
+        index = write(broken.parent, text, "index.csv")
+        with refuse(index, said):
+            find_rate(read_bvh(broken), Path(broken.name), {})
+
+
 @pytest.mark.skipif(not SALSA.is_dir(), reason="no CMU salsa in ../shared/data")
 def test_cmus_salsa_is_known() -> None:
     paths = sorted(SALSA.glob("*.bvh"))[::10]

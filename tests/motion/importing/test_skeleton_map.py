@@ -33,11 +33,12 @@ def test_unknown_skeleton_lists_joints_and_maps(tmp_path: Path) -> None:
 
 
 def test_a_file_of_two_skeletons_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bvh = read(tmp_path, "cmu_daz")
     for name in ("one", "two"):
         (tmp_path / f"{name}.yaml").write_text((SKELETONS / "cmu_daz.yaml").read_text())
     monkeypatch.setattr("memmlp.motion.importing.skeleton_map.SKELETONS", tmp_path)
     with refuse(tmp_path, "more than one"):
-        find_skeleton(read(tmp_path, "cmu_daz"))
+        find_skeleton(bvh)
 
 
 def user_map(folder: Path, **changes: object) -> Path:
@@ -62,7 +63,7 @@ def test_wrong_maps_are_refused(tmp_path: Path) -> None:
     for changes, said in (
         ({"unit": "cm"}, "unit"), ({"unit": float("nan")}, "unit"), ({"name": None}, "keys"),
         ({"up": "x"}, "y, z or auto"), ({"calibration_frame": 1}, "true or false"),
-        ({"rest": "standing"}, "rest"), ({"rest": {"hip": 90}}, "rest"),
+        ({"rest": "standing"}, "rest"), ({"rest": "frame -1"}, "frame N"), ({"rest": {"hip": 90}}, "rest"),
         ({"rest": {"hip": [90, "a", 0]}}, "rest"), ({"rest": 7}, "rest"), ({"colour": "red"}, "keys"),
         ({"joints": {}}, "joints.pelvis"), ({"joints": JOINTS_OF_DAZ | {"tail": "hip"}}, "joints.tail"),
         ({"joints": JOINTS_OF_DAZ | {"head": True}}, "joints.head"),
@@ -81,7 +82,7 @@ def test_wrong_maps_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_a_map_leaves_out_is_found(tmp_path: Path) -> None:
-    chosen = load_skeleton(str(user_map(tmp_path, unit=None, up="auto", calibration_frame=None)))
+    chosen = load_skeleton(str(user_map(tmp_path, unit=None, up="auto", calibration_frame=None, rest=None)))
     assert (chosen.unit, chosen.up, chosen.calibration_frame, chosen.rest) == (None, None, False, None)
 
 
@@ -120,6 +121,7 @@ def test_namespaces_are_left_out():
         (["Character1_Hips", "Character1_LeftArm"], ["Hips", "LeftArm"]),
         (["m_avg_root", "m_avg_L_Hip", "m_avg_R_Hip"], ["root", "L_Hip", "R_Hip"]),
         (["Armature", "a:b:Hips", "a:b:Head"], ["Armature", "Hips", "Head"]),
+        (["RL_BoneRoot", "CC_Base_Hip", "CC_Base_L_Foot"], ["RL_BoneRoot", "Hip", "L_Foot"]),
         (["Spine", "Spine1", "Spine2"], ["Spine", "Spine1", "Spine2"]),
         (["a:Hips", "b:Hips"], ["a:Hips", "b:Hips"]),
         (["joint_1", "joint_2", "joint_2.end"], ["1", "2", "2.end"]),
