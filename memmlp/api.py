@@ -55,7 +55,7 @@ def load_run(name: StrPath, outputs: StrPath | None = None, *, plugins: Sequence
             imported.
     """
     _use(plugins)
-    run = find_run(_outputs(outputs), os.fspath(name))
+    run = find_run(_find_outputs(outputs), os.fspath(name))
     check_trained(run)
     return TrainedRun(run)
 
@@ -75,7 +75,7 @@ class Runs(Sequence["TrainedRun"]):
 
     def __init__(self, outputs: StrPath | None = None, *, plugins: Sequence[str] = ()):
         _use(plugins)
-        folder = _outputs(outputs)
+        folder = _find_outputs(outputs)
         if not (folder / "runs").is_dir():
             raise InputError(f"outputs {folder}: has no folder runs; expected an outputs folder")
         self._runs = [TrainedRun(run) for run in list_runs(folder) if is_trained(run)]
@@ -103,7 +103,7 @@ class Runs(Sequence["TrainedRun"]):
 
     def per_clip(self) -> pd.DataFrame:
         """Return the rows of all runs in one DataFrame (`TrainedRun.per_clip`)."""
-        return _frame(row for run in self._runs for row in run._rows())
+        return _make_frame(row for run in self._runs for row in run._list_rows())
 
 
 class TrainedRun(os.PathLike[str]):
@@ -150,7 +150,7 @@ class TrainedRun(os.PathLike[str]):
         Raises InputError if a result file is damaged.
         """
         return {
-            mode: {branch: _numbers(errors) for branch, errors in branches.items()}
+            mode: {branch: _convert_to_numbers(errors) for branch, errors in branches.items()}
             for mode, branches in sorted(load_measured_run(self.folder).means.items())
         }
 
@@ -175,7 +175,7 @@ class TrainedRun(os.PathLike[str]):
         Raises:
             InputError: if pandas is not installed, or a result file is damaged.
         """
-        return _frame(self._rows())
+        return _make_frame(self._list_rows())
 
     @property
     def clips(self) -> list[str]:
@@ -243,7 +243,7 @@ class TrainedRun(os.PathLike[str]):
 
         return open_existing_run(self._run)
 
-    def _rows(self) -> Iterator[dict[str, Any]]:
+    def _list_rows(self) -> Iterator[dict[str, Any]]:
         measured, combined_by = load_measured_run(self.folder), self.combined_by
         for mode, branches in sorted(measured.means.items()):
             for branch in branches:
@@ -251,7 +251,7 @@ class TrainedRun(os.PathLike[str]):
                 for clip, modes in measured.clips.items():
                     facts = {"clip": clip, "group": measured.get_group(clip), "frames": modes[mode]["frames"]}
                     about = {"run": self.id, "seed": self.seed, "mode": mode, "branch": branch}
-                    yield about | {"combined_by": by} | facts | _numbers(modes[mode][branch])
+                    yield about | {"combined_by": by} | facts | _convert_to_numbers(modes[mode][branch])
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +289,7 @@ class Prediction:
 
         The mean is the clip's MPJPE. Raises InputError if the network does not have this branch.
         """
-        return self._piece(branch).errors[branch]
+        return self._make_piece(branch).errors[branch]
 
     def draw(
         self,
@@ -322,7 +322,7 @@ class Prediction:
         if poses not in range(1, 21):
             raise InputError(f"poses {poses}: must be 1 to 20")
         first, last = find_frame_range(len(self), self.clip, begin, end)
-        write_picture(file, self._piece(branch, first, last), poses)
+        write_picture(file, self._make_piece(branch, first, last), poses)
         return file
 
     def save(self, path: StrPath, *, truth: bool = False) -> Path:
@@ -349,7 +349,7 @@ class Prediction:
         write_motion(file, make_clip(self.clip, rotations, positions, self.rest), self.rest, chosen)
         return file
 
-    def _piece(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:
+    def _make_piece(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:
         from memmlp.report.pictures.clip_pictures import ClipPiece
 
         branches = {"rotation": self.positions}
@@ -361,7 +361,7 @@ class Prediction:
         )
 
 
-def _outputs(given: StrPath | None) -> Path:
+def _find_outputs(given: StrPath | None) -> Path:
     return Path(os.environ.get("MEMMLP_OUTPUTS", "outputs") if given is None else given)
 
 
@@ -381,12 +381,12 @@ def _check(key: str, value: object, allowed: Iterable[object]) -> None:
         raise InputError(f"{key} {value}: must be one of {', '.join(map(str, known))}")
 
 
-def _numbers(errors: Mapping[str, Any]) -> dict[str, float]:
+def _convert_to_numbers(errors: Mapping[str, Any]) -> dict[str, float]:
     """Convert metrics to numbers; in files, NaN is text."""
     return {name: float(value) for name, value in errors.items()}
 
 
-def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
+def _make_frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
     """Make a pandas DataFrame from rows, with the metrics' units. Raises InputError without pandas."""
     try:
         import pandas as pd

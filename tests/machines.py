@@ -43,7 +43,7 @@ class OwnLeases(threading.local, UserDict):
 def apart(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Let every thread be a machine. No lease is renewed by itself, and the clock stands until it is set."""
     clock = Clock()
-    monkeypatch.setattr(lease, "process_namespace", lambda: threading.current_thread().name)
+    monkeypatch.setattr(lease, "compute_process_namespace", lambda: threading.current_thread().name)
     monkeypatch.setattr(lease, "_change_timer", OwnChanges(clock))
     monkeypatch.setattr(lease, "_leases", OwnLeases())
     monkeypatch.setattr(lease, "BEAT", 1e6)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
-from memmlp.cli.workers import Workers, start_fleet, worker_options
+from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.errors import InputError
 from memmlp.runs.identity import NETWORK
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     multiple=True,
     help="Run only this variant and its prerequisites; repeatable.",
 )
-@worker_options
+@add_worker_options
 @click.option("--status", is_flag=True, help="Only show the sweep's progress.")
 @click.option("--dry-run", is_flag=True, help="Only show the missing runs and the expected time.")
 @click.option("--retry", is_flag=True, help="Repeat failed runs.")

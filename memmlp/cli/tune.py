@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from memmlp.cli.options import outputs_option, plugins_option
-from memmlp.cli.workers import Workers, start_fleet, worker_options
+from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
 from memmlp.common.overrides import Override
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @click.command("tune")
 @click.argument("overrides", nargs=-1)
-@worker_options
+@add_worker_options
 @click.option("--status", is_flag=True, help="Only show the search's progress.")
 @click.option(
     "--config-dir",

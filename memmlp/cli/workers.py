@@ -141,7 +141,7 @@ def get_log_path(folder: Path) -> Path:
     return folder / "workers" / "%j"
 
 
-def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
+def add_worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the worker options to a command, which receives their values as `workers`.
 
     The command receives the overrides without the executor's overrides as `overrides`.
@@ -166,7 +166,7 @@ def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
     )
 
     @functools.wraps(command)
-    def wrapped(
+    def call_with_workers(
         overrides: tuple[str, ...],
         count: int | None,
         gpus_per_worker: int | None,
@@ -178,8 +178,8 @@ def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
         command(overrides=remaining, workers=workers, **others)
 
     for option in reversed(options):
-        wrapped = option(wrapped)
-    return wrapped
+        call_with_workers = option(call_with_workers)
+    return call_with_workers
 
 
 def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple[str, ...]]:

@@ -147,7 +147,7 @@ def find_component(slot: str, name: str) -> Component:
 
 
 def list_component_names(slot: str) -> list[str]:
-    """Return the names of the components of a slot, in alphabetical order."""
+    """Return a slot's component names in alphabetical order."""
     return sorted(name for group, name in collect_components() if group == slot)
 
 
@@ -183,7 +183,7 @@ def collect_components() -> dict[tuple[str, str], Component]:
 
 
 def add_package(package: str, root: Path | None) -> None:
-    """Add the components of a user's package, which is a folder or a single file; with None, remove them.
+    """Add the components of a user's package: a folder or a file. If `root` is None, remove them.
 
     Raises:
         InputError: if the package declares an option that already exists.

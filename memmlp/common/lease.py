@@ -48,7 +48,7 @@ ENDED = ("Z", "X")  # states of an ended process that its parent has not collect
 
 
 @functools.cache
-def process_namespace() -> str:
+def compute_process_namespace() -> str:
     """Return a digest of machine, boot and container; together with it, a pid identifies a process."""
     try:
         namespace = os.readlink(PROC / "self/ns/pid")
@@ -60,12 +60,12 @@ def process_namespace() -> str:
 
 def current_process() -> dict[str, Any]:
     """Describe this process; other processes can pass the description to `is_alive`."""
-    return {"pid": os.getpid(), "born": _read_start_time(os.getpid()), "place": process_namespace()}
+    return {"pid": os.getpid(), "born": _read_start_time(os.getpid()), "place": compute_process_namespace()}
 
 
 def is_alive(process: Mapping[str, Any]) -> bool | None:
     """Return whether a process (`current_process`) is alive; None if it runs on another machine."""
-    if process.get("place") != process_namespace():
+    if process.get("place") != compute_process_namespace():
         return None
     pid = int(process["pid"])
     try:
@@ -105,7 +105,7 @@ class ChangeTimer:
         self.seen: dict[Hashable, tuple[object, float]] = {}
 
     def seconds_unchanged(self, key: Hashable, read: Callable[[], object]) -> float:
-        """Read a value, and return for how many seconds it has certainly been unchanged; 0 at the first call.
+        """Read a value, and return for how many seconds it has at least been unchanged; 0 at first.
 
         Args:
             key: the value's name.
@@ -217,7 +217,7 @@ class Lock:
         owner = self.owner
         if not owner:
             return "another process"
-        where = "" if owner["place"] == process_namespace() else " on another machine"
+        where = "" if owner["place"] == compute_process_namespace() else " on another machine"
         return f"process {owner['pid']}{where} since {owner['since']}"
 
     @property

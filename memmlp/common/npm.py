@@ -108,20 +108,20 @@ def fetch_tarball(package: Package) -> Path:
         if _has_digest(package, path.read_bytes()):
             return path
         raise InputError(f"{path}: must be {package} with the pinned digest {package.integrity[:20]}...")
-    path = cache_folder() / package.file
+    path = find_cache_folder() / package.file
     if not (path.is_file() and _has_digest(package, path.read_bytes())):
-        content = _download(package, registry_url())
+        content = _download(package, find_registry_url())
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, content)
     return path
 
 
-def cache_folder() -> Path:
+def find_cache_folder() -> Path:
     """Return the folder where downloaded tarballs are kept."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "memmlp" / "npm"
 
 
-def registry_url() -> str:
+def find_registry_url() -> str:
     """Return the address of the registry."""
     given = (value for name, value in os.environ.items() if name.upper() == "NPM_CONFIG_REGISTRY")
     if address := next(given, ""):
@@ -130,7 +130,7 @@ def registry_url() -> str:
 
 
 def _download(package: Package, host: str) -> bytes:
-    announce(f"download {package} from the npm registry and keep it in {cache_folder()}")
+    announce(f"download {package} from the npm registry and keep it in {find_cache_folder()}")
     instead = f"or run npm pack {package} and set {FOLDER} to the folder with {package.file}"
     try:
         with urllib.request.urlopen(package.url(host), timeout=TIMEOUT) as answer:

@@ -160,7 +160,7 @@ def make_tasks(request: RunRequest, data: str) -> list[RunTask]:
     from memmlp.training.request import remove_refiner
 
     bare = remove_refiner(request.config) if request.config["refiner"] is not None else request.config
-    *prerequisites, identity = request.identities(data)
+    *prerequisites, identity = request.compute_identities(data)
     tasks: list[RunTask] = []
     for one in prerequisites:
         tasks.append(RunTask(one.id, one.kind, bare, tasks[-1].id if tasks else None))

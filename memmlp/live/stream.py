@@ -278,7 +278,7 @@ class Stream:
             else:
                 self.network.advance()
             self.step_seconds += perf_counter() - began
-        local, scale = sixd_to_matrix(self._rotations()), self.wearer.scale
+        local, scale = sixd_to_matrix(self._compute_rotations()), self.wearer.scale
         self._last = BodyFrame(
             frames[-1].time,
             local,
@@ -292,7 +292,7 @@ class Stream:
         )
         return self._last
 
-    def _rotations(self) -> np.ndarray:
+    def _compute_rotations(self) -> np.ndarray:
         """Return the rotations (22, 6) of the last step, after inverse kinematics if `ik` is set."""
         sixd: np.ndarray = self.network.rotation6d
         if self.ik is None:

@@ -164,7 +164,7 @@ def save_calibration(path: Path, calibration: Calibration, body: BodyTree) -> No
     fields = {
         "memmlp": "calibration",
         "space": calibration.space,
-        "joints": _tracked_joints(body).tolist(),
+        "joints": _compute_tracked_joints(body).tolist(),
         "height": calibration.height,
         "floor": calibration.floor,
         "offsets": offsets and {name: part.tolist() for name, part in offsets._asdict().items()},
@@ -197,7 +197,8 @@ def read_calibration(path: Path, space: SpaceName, body: BodyTree) -> Calibratio
         offsets = fields["offsets"]
         if offsets is not None:
             offsets = check_offsets(Offsets(offsets["positions"], offsets["rotations"]))
-        away = np.linalg.norm(np.reshape(fields["joints"], (3, 3)) - _tracked_joints(body), axis=1).max()
+        recorded = np.reshape(fields["joints"], (3, 3))
+        away = np.linalg.norm(recorded - _compute_tracked_joints(body), axis=1).max()
         if not away <= SAME:
             raise InputError(f"it is for another body, where head or wrists are {100 * away:.1f} cm away")
         return Calibration(space, offsets, fields["height"], fields["floor"])
@@ -205,7 +206,7 @@ def read_calibration(path: Path, space: SpaceName, body: BodyTree) -> Calibratio
         raise InputError(f"{path}: cannot be used ({error}); {MADE}") from None
 
 
-def _tracked_joints(body: BodyTree) -> np.ndarray:
+def _compute_tracked_joints(body: BodyTree) -> np.ndarray:
     """Return the rest positions (3, 3) of head and wrists, metres, relative to the lowest joint's height.
 
     The offsets of a calibration are only valid for a body with these positions.

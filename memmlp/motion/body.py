@@ -78,13 +78,13 @@ _REST = {
 def make_builtin_rest_joints() -> np.ndarray:
     """Return the rest positions (22, 3) of the built-in adult: metres, SMPL's body frame, pelvis at 0."""
 
-    def rest(name: str) -> tuple[float, float, float]:
+    def get_rest_position(name: str) -> tuple[float, float, float]:
         if name.startswith("right_"):
             x, y, z = _REST["left_" + name.removeprefix("right_")]
             return -x, y, z
         return _REST[name]
 
-    return np.array([rest(name) for name in JOINTS])
+    return np.array([get_rest_position(name) for name in JOINTS])
 
 
 def load_rest_joints(body: str | Path) -> np.ndarray:

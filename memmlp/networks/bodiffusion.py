@@ -212,12 +212,12 @@ class BoDiffusion(WindowModel):
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))[windows]
         times_covered = torch.bincount(windows.flatten(), minlength=count)[:, None]
 
-        def total(parts: Tensor) -> Tensor:
+        def sum_parts(parts: Tensor) -> Tensor:
             return parts.new_zeros(count, ROTATION.stop).index_add(0, windows.flatten(), parts.flatten(0, 1))
 
         def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
             mean, variance = self.step(noisy[windows], encoded, index)
-            return total(mean) / times_covered, total(variance).sqrt() / times_covered
+            return sum_parts(mean) / times_covered, sum_parts(variance).sqrt() / times_covered
 
         rotation = self.diffusion.sample(step, self.draw_noise(count).to(self.noises))
         return self.normalizer.decode_rotations(rotation, sparse)

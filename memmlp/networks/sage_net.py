@@ -88,12 +88,12 @@ class SAGENetGraph(StemGraph):
         self.widths = [one.linear.out_features for one in conditions]
         self.width = sum(self.widths)
 
-        def entering(encoded: Tensor) -> Tensor:
+        def embed_inputs(encoded: Tensor) -> Tensor:
             return torch.cat([one.linear(one.mixture(encoded).flatten(-2)) for one in conditions], -1)
 
         nothing = torch.zeros(1, SPARSE_DIM).to(model.noises)
-        offset = entering(nothing)
-        self.sparse = make_linear((entering(torch.eye(SPARSE_DIM).to(nothing)) - offset).T, offset[0])
+        offset = embed_inputs(nothing)
+        self.sparse = make_linear((embed_inputs(torch.eye(SPARSE_DIM).to(nothing)) - offset).T, offset[0])
         self.register_buffer(
             "places",
             make_position_embeddings(nothing.new_zeros(self.frames // 2, model.decoder.stem.out_features)),

@@ -76,7 +76,7 @@ class KeptResults:
 
     @cached_property
     def run_names(self) -> dict[int, str]:
-        """The runs' names in the file, by their objects' `id()`.
+        """The name of each run in the file, by `id(run)`.
 
         A name is the run's id. If the file has several evaluations or deployments of a run, a digest of the
         record is appended.

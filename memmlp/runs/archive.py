@@ -19,7 +19,7 @@ from pathlib import Path
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_file, file_digest, read_json, sync_folder
 from memmlp.runs.identity import ID
-from memmlp.runs.lookup import notes_path
+from memmlp.runs.lookup import get_notes_path
 from memmlp.runs.run import Run
 
 MAX_FILES = 1000
@@ -47,8 +47,9 @@ def export_run(run: Run, out: Path) -> str:
         raise InputError(f"run {run.id}: must be finished; its status is {run.status}")
     if changed := run.verify():
         raise InputError(f"run {run.id}: must be unchanged; missing or changed files: {', '.join(changed)}")
-    own = (path for pattern in run.FILES for path in sorted(run.folder.glob(pattern)))
-    files = {path.relative_to(run.folder).as_posix(): path for path in (*own, notes_path(run), run.marker)}
+    run_files = [path for pattern in run.FILES for path in sorted(run.folder.glob(pattern))]
+    paths = [*run_files, get_notes_path(run), run.marker]
+    files = {path.relative_to(run.folder).as_posix(): path for path in paths}
     out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(out) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, path in files.items():

@@ -14,10 +14,10 @@ from memmlp.runs.environment import describe_environment
 from memmlp.runs.identity import (
     belongs_to_folder,
     find_version,
+    get_solver_name,
     has_configured_inference,
     hash_evaluation_settings,
     list_outdated,
-    name_solver,
 )
 
 COMBINED = "combined"
@@ -78,14 +78,14 @@ def make_preference_key(
     time.
     """
     settings = report.get("settings") or {}
-    configured = name_solver(settings) == name_solver(config.get("evaluation") or {})
+    configured = get_solver_name(settings) == get_solver_name(config.get("evaluation") or {})
     return is_current(path, report), configured, str(report.get("made"))
 
 
 def find_combined_solvers(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
-    """Return the inverse kinematics (`name_solver`) of the branch `combined`, by mode; the last one wins."""
+    """Return the solver (`get_solver_name`) of each mode's branch `combined`, from the last report."""
     return {
-        str(report.get("mode")): name_solver(report.get("settings") or {})
+        str(report.get("mode")): get_solver_name(report.get("settings") or {})
         for report in reports
         if COMBINED in report["mean"]
     }
@@ -99,7 +99,7 @@ def keep_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]
     last = find_combined_solvers(reports)
 
     def fits(report: Mapping[str, Any]) -> bool:
-        return name_solver(report.get("settings") or {}) == last.get(str(report.get("mode")))
+        return get_solver_name(report.get("settings") or {}) == last.get(str(report.get("mode")))
 
     return [dict(report) if fits(report) else _remove_combined(report) for report in reports]
 

@@ -206,7 +206,7 @@ def select_evaluation_settings(
     return {"mode": mode, **solver, **select_inference_config(config), **drawn, **further}
 
 
-def name_solver(settings: Mapping[str, Any]) -> str | None:
+def get_solver_name(settings: Mapping[str, Any]) -> str | None:
     """Return the name of the inverse kinematics in evaluation settings, such as "arms"; None without one.
 
     For L-BFGS, the name contains the number of iterations: "lbfgs-15".

@@ -121,14 +121,14 @@ class Notes:
     note: str = ""
 
 
-def notes_path(run: Run) -> Path:
+def get_notes_path(run: Run) -> Path:
     """Return the path of the file with a run's tags and note."""
     return run.folder / "notes.json"
 
 
 def read_notes(run: Run) -> Notes:
     """Return a run's tags and note; both are empty if the file is missing or damaged."""
-    content = read_json(notes_path(run))
+    content = read_json(get_notes_path(run))
     tags, note = content.get("tags"), content.get("note")
     words = [tag for tag in tags if isinstance(tag, str)] if isinstance(tags, list) else []
     return Notes(tuple(sorted(set(words))), note if isinstance(note, str) else "")
@@ -163,5 +163,5 @@ def _check_tag(tag: str) -> str:
 
 
 def _write_notes(run: Run, notes: Notes) -> Notes:
-    write_json(notes_path(run), {"tags": list(notes.tags), "note": notes.note})
+    write_json(get_notes_path(run), {"tags": list(notes.tags), "note": notes.note})
     return notes

@@ -39,8 +39,8 @@ def build_record(run: Run) -> dict[str, Any]:
     - Results, such as `stream.rotation.MPJPE`. For the rotation branch, there is also a short key:
       `stream.MPJPE`. The branch after inverse kinematics has the solver in its name:
       `stream.combined-arms.MPJPE`.
-    - Times and size of the file that the config asks for. If only another file was exported, its settings are
-      in the key: `latency-int8.median_ms`.
+    - Times and size of the file that the config requests. If the exported file differs from it, the key names
+      the difference: `latency-int8.median_ms`.
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     named = add_solver_names(run.results, run.configured_evaluations.combined_solvers)
@@ -243,7 +243,7 @@ def _is_satisfied(actual: Any, sign: str, value: str) -> bool:
 
 
 def _is_equal(actual: Any, value: str) -> bool:
-    """Return whether a run's value equals a typed one; a number may be typed rounded, like tables show it."""
+    """Return whether a run's value equals a typed value, which may be rounded like in tables."""
     if isinstance(actual, tuple):  # the tags of a run
         return value in actual
     if isinstance(actual, int | float) and not isinstance(actual, bool):

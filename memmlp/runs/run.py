@@ -55,7 +55,7 @@ def _parse(text: str) -> Any:
 
 
 def name_latency(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
-    """Return "latency", or for another file than the config asks for, a name such as "latency-int8"."""
+    """Return "latency", or a name such as "latency-int8" for a file that the config does not request."""
     return "-".join(filter(None, ["latency", describe_export_difference(deployed.settings, config)]))
 
 
@@ -148,7 +148,7 @@ class Run:
         the config, the latest.
         """
         config = self.config
-        return self._best_deployment(
+        return self._find_best_deployment(
             config,
             lambda one: (
                 one.is_current, bool(one.accurate_int8_file),
@@ -168,7 +168,7 @@ class Run:
         settings of the config, the latest. `name_latency` names different export settings.
         """
         requested = select_deployment_settings(config)
-        return self._best_deployment(
+        return self._find_best_deployment(
             config,
             lambda one: (
                 not describe_export_difference(one.settings, config), one.is_current,
@@ -176,7 +176,7 @@ class Run:
             ),
         )  # fmt: skip
 
-    def _best_deployment(
+    def _find_best_deployment(
         self, config: Mapping[str, Any], rank: Callable[[DeploymentFolder], tuple[Any, ...]]
     ) -> DeploymentFolder:
         every = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
@@ -359,11 +359,11 @@ class Run:
     def results(self) -> dict[str, Any]:
         """The results with the run's own settings: mode -> branch -> metric, and "latency".
 
-        If only another file was exported than the config asks for, the key names the difference:
-        "latency-int8", "latency-naive" (`find_shown_deployment`).
+        If the exported file differs from the requested file, the key names the difference: "latency-int8",
+        "latency-naive" (`find_shown_deployment`).
 
-        If a mode was evaluated with several kinds of inverse kinematics, the one in the run's config counts,
-        otherwise the last one. The results of a VQ-VAE have other keys.
+        Of several kinds of inverse kinematics, the kind in the run's config counts, or else the last kind.
+        The results of a VQ-VAE have other keys.
 
         Raises:
             InputError: if an evaluation file is damaged.

@@ -62,7 +62,7 @@ def describe_device(device: torch.device) -> dict[str, Any]:
 def use_threads(number: int) -> None:
     """Set torch's number of CPU threads; 0 restores torch's default.
 
-    One process may perform several runs. 0 undoes the setting of an earlier run.
+    One process may perform several runs with different settings.
     """
     torch.set_num_threads(number or DEFAULT_THREADS)
 

@@ -243,7 +243,7 @@ def record(
 def validate(task: TrainingTask, average: Average) -> dict[str, float]:
     """Validate the final weights (see Average), and return the task's values."""
     task.module.eval()
-    with average.using_average(), label_progress("validation"):
+    with average.use_average(), label_progress("validation"):
         return task.validate()
 
 
@@ -258,7 +258,7 @@ def save(
 ) -> None:
     """Write a checkpoint after `step` steps and `seconds` of training.
 
-    The first process writes it; other processes continue with the first one's weights.
+    The first process writes it; the other processes copy the weights of the first process.
     """
     distributed.copy_from_first(task.module)
     if not distributed.is_first():
@@ -281,7 +281,7 @@ def resume(
     best: BestWeights,
     run: Run,
 ) -> tuple[int, float]:
-    """Load the run's checkpoint if there is one; return the numbers of finished steps and of seconds."""
+    """Load the checkpoint if there is one; return the finished steps, and the seconds of training."""
     state = checkpoint.read(run.checkpoint) if distributed.is_first() and run.checkpoint.exists() else None
     state = distributed.broadcast(state)
     if state is None:

@@ -399,7 +399,7 @@ class Average:
         """Restore the average from a checkpoint's tensors. Names without "average." are ignored."""
 
     @contextmanager
-    def using_average(self) -> Iterator[None]:
+    def use_average(self) -> Iterator[None]:
         """Use the final weights within the context, then restore the last step's weights bit for bit."""
         before = {name: one.detach().clone() for name, one in self.parameters.items()}
         self.write_into_module()
@@ -465,9 +465,9 @@ class ScheduleFreeAverage(Average):
         self.optimiser.eval()  # type: ignore[attr-defined]
 
     @contextmanager
-    def using_average(self) -> Iterator[None]:
+    def use_average(self) -> Iterator[None]:
         # The optimiser can restore the last step's weights by itself, but not bit for bit.
-        with super().using_average():
+        with super().use_average():
             yield
             self.optimiser.train()  # type: ignore[attr-defined]
 

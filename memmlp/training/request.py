@@ -63,7 +63,7 @@ class RunRequest:
         """The ids of the stages after training: the evaluations and the deployment."""
         return (*self.evaluations.values(), *([self.deployment_id] if self.deployment_id else []))
 
-    def identities(self, data_digest: str) -> list[Identity]:
+    def compute_identities(self, data_digest: str) -> list[Identity]:
         """Return the identities of the required runs in training order; the network's run is the last one."""
         found: list[Identity] = []
         for kind, config in self._run_chain:
@@ -72,7 +72,7 @@ class RunRequest:
 
     def identity(self, data_digest: str) -> Identity:
         """Return the identity of the network's run, given the digest of the data."""
-        return self.identities(data_digest)[-1]
+        return self.compute_identities(data_digest)[-1]
 
     @cached_property
     def _run_chain(self) -> list[tuple[str, dict[str, Any]]]:
@@ -148,7 +148,7 @@ def announce_data(data: PreparedMotion) -> None:
 
 
 def list_missing_modes(request: RunRequest, run: Run) -> list[str]:
-    """Return the modes to evaluate, including modes measured by other code of custom metrics.
+    """Return the modes to evaluate: missing modes, and modes whose custom metrics have new code.
 
     A package's code may change without a new component version. Its metrics are then measured again.
     """

@@ -108,7 +108,7 @@ def _train_named_stages(experiment: Experiment) -> None:
     """Train the stages that the first process broadcasts, until it broadcasts "end"."""
     while (stage := distributed.broadcast("")) != "end":
         data = experiment.motion.prepare()  # the first process has prepared it
-        identities = experiment.identities(data.digest)
+        identities = experiment.compute_identities(data.digest)
         runs = [Run.from_id(experiment.outputs, identity.id) for identity in identities]
         number = [identity.kind for identity in identities].index(stage)
         training = (*experiment.prerequisites, experiment.training)[number]
@@ -207,7 +207,8 @@ def make_prerequisites(experiment: Experiment, data: PreparedMotion, last: str |
     if experiment.unrefined:
         return run_experiment(experiment.unrefined).run
     run: Run | None = None
-    for training, identity in zip(experiment.prerequisites, experiment.identities(data.digest), strict=False):
+    identities = experiment.compute_identities(data.digest)
+    for training, identity in zip(experiment.prerequisites, identities, strict=False):
         run = find_or_train(experiment, training, identity, data, run)
         if run.id == last:
             break

@@ -164,7 +164,7 @@ class SAGEPartTraining(Training):
 
     @property
     def description(self) -> str:
-        """What the training does, in words."""
+        """A short text about the training, for progress messages."""
         return f"{self.kind.replace('_', ' ')}: training for {self.network.optim.steps} steps"
 
     def train(

@@ -91,7 +91,7 @@ def test_this_process_is_alive_and_an_earlier_one_with_its_number_is_not(monkeyp
     here = current_process()
     assert is_alive(here) is True
     assert is_alive(here | {"born": "1"}) is False
-    monkeypatch.setattr(lease, "process_namespace", lambda: "elsewhere")
+    monkeypatch.setattr(lease, "compute_process_namespace", lambda: "elsewhere")
     assert is_alive(here) is None
 
 

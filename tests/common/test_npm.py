@@ -74,7 +74,7 @@ def test_another_file_is_refused_and_not_kept(package, place, monkeypatch):
     serve(place, packed({"package/dist/a.js": b"evil"}), monkeypatch)
     with pytest.raises(InputError, match=r"^@scope/name@1.2.3: the file from the npm registry"):
         npm.fetch_tarball(pinned)
-    assert not list(npm.cache_folder().glob("*"))
+    assert not list(npm.find_cache_folder().glob("*"))
 
 
 def test_a_folder_of_tarballs_comes_first(package, place, monkeypatch):

@@ -178,7 +178,7 @@ def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
     base = identity()
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
     assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "loggers=none"))
-    assert experiment_of().identities("data") == [experiment_of().identity("data")]
+    assert experiment_of().compute_identities("data") == [experiment_of().identity("data")]
 
 
 def test_a_refiner_has_a_rate_of_its_own_and_its_network_keeps_its():

@@ -14,8 +14,8 @@ from memmlp.runs.lookup import (
     add_tags,
     count_training_frames,
     find_run,
+    get_notes_path,
     list_runs,
-    notes_path,
     read_notes,
     remove_tags,
     set_note,
@@ -94,5 +94,5 @@ def test_bad_tags_and_notes_are_refused(tmp_path: Path):
 def test_a_damaged_file_says_nothing(tmp_path: Path):
     run = begun(tmp_path)
     for content in ("", "[]", '{"tags": 5, "note": []}', '{"tags": [3], "note": null}'):
-        notes_path(run).write_text(content)
+        get_notes_path(run).write_text(content)
         assert read_notes(run) == Notes()

@@ -120,7 +120,7 @@ def test_an_exponential_moving_average_by_hand():
         average.update(step)
         decay = min(0.3, (1 + step) / (10 + step))
         expected = decay * expected + (1 - decay) * value
-    with average.using_average():
+    with average.use_average():
         assert model.weight.item() == pytest.approx(expected)
     assert model.weight.item() == 8
 

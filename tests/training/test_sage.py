@@ -102,4 +102,4 @@ def test_a_key_changes_the_runs_in_which_it_acts_and_all_that_build_upon_them():
 
 def chain_of(cfg) -> list[str]:
     experiment = build_experiment(cfg)
-    return [identity.id for identity in experiment.identities("d")]
+    return [identity.id for identity in experiment.compute_identities("d")]

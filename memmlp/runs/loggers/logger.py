@@ -214,7 +214,7 @@ class RunLogger(Protocol):
         """The address or folder where the logger shows runs."""
 
     def fingerprint(self, run_id: str) -> str | None:
-        """Return the fingerprint that `ShownRun.end` stored for a run; None if the run has not ended here."""
+        """Return the fingerprint that `ShownRun.end` stored for a run; None if its end is missing."""
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownRun:
         """Show a run with these facts and points; all earlier data of the run in the logger is replaced."""

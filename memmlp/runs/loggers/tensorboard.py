@@ -49,18 +49,18 @@ class TensorBoard:
 
     def fingerprint(self, run_id: str) -> str | None:
         """Return the fingerprint in a run's folder of event files; None if the run has not ended there."""
-        files = (folder / FINGERPRINT for folder in self._folders(run_id))
+        files = (folder / FINGERPRINT for folder in self._find_folders(run_id))
         return next((file.read_text() for file in files if file.exists()), None)
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInTensorBoard:
         """Start a new event file for a run, and remove older ones."""
-        for old in self._folders(facts.id):
+        for old in self._find_folders(facts.id):
             shutil.rmtree(old)
         shown = ShownInTensorBoard(Path(self.place) / _make_folder_name(facts.name, facts.id))
         shown.log(points)
         return shown
 
-    def _folders(self, run_id: str) -> Iterator[Path]:
+    def _find_folders(self, run_id: str) -> Iterator[Path]:
         return Path(self.place).glob(f"* {run_id[:8]}")
 
 

@@ -55,7 +55,7 @@ class WandB:
 
     def fingerprint(self, run_id: str) -> str | None:
         """Return the fingerprint of the run's W&B offline run; None if the offline run has not ended."""
-        files = (folder / FINGERPRINT for folder in self._folders(run_id))
+        files = (folder / FINGERPRINT for folder in self._find_folders(run_id))
         return next((file.read_text() for file in files if file.exists()), None)
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInWandB:
@@ -64,7 +64,7 @@ class WandB:
         run = self._start_offline_run(
             facts.id, facts.name, tags=list(facts.tags), notes=facts.note or None, config=config
         )
-        shown = ShownInWandB(run, self._folders(facts.id)[0])
+        shown = ShownInWandB(run, self._find_folders(facts.id)[0])
         shown.log(points)
         return shown
 
@@ -72,8 +72,8 @@ class WandB:
         os.environ.update(OFFLINE)
         import wandb
 
-        stamps = {old.name.split("-")[2] for old in self._folders(run_id)}
-        for old in self._folders(run_id):
+        stamps = {old.name.split("-")[2] for old in self._find_folders(run_id)}
+        for old in self._find_folders(run_id):
             shutil.rmtree(old)
         while time.strftime("%Y%m%d_%H%M%S") in stamps:  # wandb would leave a folder with the same name empty
             time.sleep(0.05)
@@ -87,7 +87,7 @@ class WandB:
             mode="offline", settings=settings, reinit="create_new", **options,
         )  # fmt: skip
 
-    def _folders(self, run_id: str) -> list[Path]:
+    def _find_folders(self, run_id: str) -> list[Path]:
         return list(Path(self.place).glob(f"offline-run-*-{run_id}"))
 
 
