@@ -39,7 +39,7 @@ class BestWeights:
             raise InputError(f"optim.best_by: '{self.metric}' is not validated; expected another branch")
         if values[self.metric] < self.error:
             self.step, self.error = step, values[self.metric]
-            with average.using_average():
+            with average.use_average():
                 self.weights = {name: one.detach().clone() for name, one in self.module.state_dict().items()}
 
     def write_into_module(self) -> None:
