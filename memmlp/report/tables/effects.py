@@ -16,6 +16,7 @@ from memmlp.report.tables.measured_run import SHARED_METRIC, MeasuredRun, select
 from memmlp.report.tables.statistics import (
     compute_detectable,
     compute_equivalence_p,
+    compute_flip_p,
     correct_by_holm,
     count_needed_seeds,
     decide_verdict,
@@ -185,7 +186,7 @@ def estimate_effects(
     Args:
         pairs: the differences.
         smallest: the smallest effect of interest by metric.
-        sensitivity: whether to compute detectable effects, which doubles the time.
+        sensitivity: whether to compute detectable effects and sign-flip p-values, which doubles the time.
     """
     found: dict[Key, Effect] = {}
     comparisons = max(1, count_testable(pairs))
@@ -200,11 +201,12 @@ def estimate_effects(
         same = compute_equivalence_p(differences, margins, groups)
         nothing = np.full(len(keys), np.nan)
         seen = compute_detectable(differences, comparisons, groups) if sensitivity else nothing
+        flips = compute_flip_p(differences, groups) if sensitivity else nothing
         numbers = estimate_paired_effects(differences, groups)
-        columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
-        for key, mean, low, high, p, equal, least in columns:
-            values = {"low": low, "high": high}
-            values |= {"p": p, "equal": equal, "detectable": least} if pairs[key].is_testable else {}
+        columns = zip(keys, *numbers[:4], same, seen, flips, strict=True)
+        for key, mean, low, high, p, equal, least, flip in columns:
+            values, tested = {"low": low, "high": high}, {"p": p, "equal": equal, "detectable": least}
+            values |= {**tested, "flips": flip} if pairs[key].is_testable else {}
             known: dict[str, Any] = {name: convert_nan_to_none(number) for name, number in values.items()}
             found[key] = Effect(float(mean), **known, **size)
     return {key: found[key] for key in pairs}
@@ -256,17 +258,19 @@ def _add_verdicts(
 ) -> dict[Key, Effect]:
     """Return the effects with verdicts and corrected p-values.
 
-    Holm's correction treats differences and equivalences as two separate families of p-values.
+    Holm's correction treats differences, equivalences and sign flips as separate families of p-values.
     """
     keys = list(tested)
-    different = correct_by_holm(np.array([convert_none_to_nan(tested[key].p) for key in keys]))
-    equal = correct_by_holm(np.array([convert_none_to_nan(tested[key].equal) for key in keys]))
+    families = (
+        correct_by_holm(np.array([convert_none_to_nan(getattr(tested[key], name)) for key in keys]))
+        for name in ("p", "equal", "flips")
+    )
     judged = {}
-    for key, p, q in zip(keys, different, equal, strict=True):
+    for key, p, q, flips in zip(keys, *families, strict=True):
         verdict = decide_verdict(float(p), float(q), tested[key].mean, printed.get(key))
-        judged[key] = replace(
-            tested[key], holm=convert_nan_to_none(p), equal=convert_nan_to_none(q), verdict=verdict
-        )
+        corrected = {"holm": p, "equal": q, "flips": flips}
+        numbers: dict[str, Any] = {name: convert_nan_to_none(one) for name, one in corrected.items()}
+        judged[key] = replace(tested[key], **numbers, verdict=verdict)
     return judged
 
 

@@ -34,7 +34,7 @@ TEX_ESCAPES = {
 }  # fmt: skip
 
 Line = tuple[tuple[str, ...], ...]
-"""A line of cells: variant, seeds, and one cell for each metric. A cell has one to three parts."""
+"""A line of cells: variant, seeds, and one cell for each metric. A cell has one to five parts."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def make_legend(table: Table) -> list[str]:
                 f"{', '.join(parts)} seeds, which share the 5 %; (3): decided at 3 seeds, and final; means "
                 "and intervals use all seeds"
             )
-        lines += _describe_power(table)
+        lines += [*_explain_flips(table), *_describe_power(table)]
     if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
         lines.append(_summarize_agreement(table))
     return lines
@@ -154,6 +154,18 @@ def _explain_verdicts(table: Table) -> str:
         "higher or lower (significant, where the paper prints no difference), equivalent (nearer to 0 than "
         f"the smallest effect of interest: {', '.join(margins)}), inconclusive (none of these)"
     )
+
+
+def _explain_flips(table: Table) -> list[str]:
+    effects = [effect for mode in table.modes for *_, effect in table.list_effects(mode)]
+    if all(effect.flips is None for effect in effects):
+        return []
+    more = sum(effect.is_decided_by_flips for effect in effects)
+    return [
+        "p, flips: corrected p-values of Student's t for skewed groups, which decides the verdict, and of "
+        "sign flips, which assume symmetric differences; "
+        f"flips alone would decide {more} inconclusive comparisons"
+    ]
 
 
 def _describe_power(table: Table) -> list[str]:
@@ -223,7 +235,7 @@ def format_value(cell: Cell, metric: str) -> str:
 
 
 def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
-    """Return the parts of a cell: difference, interval and verdict; for a cost, difference and ratio.
+    """Return the parts of a cell: difference, interval, verdict, p-values; for a cost, difference and ratio.
 
     A significant difference has a star. The ratio is that of a variant's cost to the control's cost.
     """
@@ -244,7 +256,9 @@ def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
     star = "*" if effect.is_significant else ""
     at = f" ({effect.decided})" if effect.decided else ""
     verdict = () if effect.verdict is None else (f"{effect.verdict}{at}",)
-    return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict
+    numbers = {"p": effect.holm, "flips": effect.flips} if effect.flips is not None else {}
+    both = [f"{name} {format_significant(p, 2)}" for name, p in numbers.items() if p is not None]
+    return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict, *both
 
 
 def format_number(value: float) -> str:

@@ -124,6 +124,9 @@ function effects(found, draw, head = 'h2') {
     h('p', { class: 'faint' }, note), forest(rows, { label: found.headings[metric].replace(/ ↓| ↑/, ''), smallest: found.smallest[metric] }));
 }
 
+// Both corrected p-values, where sign flips were computed.
+const bothP = ({ holm, flips }) => ((flips ?? null) === null || holm === null ? '' : `p ${number(Number(holm.toPrecision(2)))}, flips ${number(Number(flips.toPrecision(2)))}`);
+
 const significant = effect => Boolean(effect) && effect.holm !== null && effect.holm < effect.level;
 
 // Seeds spent in rounds: what each interim analysis decided, and the progress of each variant.
@@ -147,7 +150,8 @@ function cell({ mean, sd, effect, paper, paper_effect: paperEffect }, metric) {
   return [
     h('span', { class: 'strong' }, mean === null ? DASH : metricNumber(metric, mean), sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(sd, mean >= 1000 ? 0 : decimals(mean))}`)),
     effect && h('span', { class: significant(effect) ? 'strong' : '' }, signed(effect.mean, digits), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`)),
-    effect?.verdict && [h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null],
+    effect?.verdict && [h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null,
+      bothP(effect) ? h('small', { class: 'faint' }, ` ${bothP(effect)}`) : null],
     paper !== null && h('small', { class: 'faint' }, `paper ${number(paper)}`, paperEffect === null ? null : ` (${signed(paperEffect)})`),
   ];
 }
