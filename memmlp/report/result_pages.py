@@ -12,12 +12,15 @@ from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Cell, Row, Table
 from memmlp.report.tables.table_text import (
+    CONFOUNDED,
     MINUS,
     MISSING,
     add_unit,
     count_decimals,
     escape_markdown,
     find_unit,
+    format_branch_effect,
+    format_counts,
     format_effect,
     format_number,
     format_value,
@@ -161,7 +164,7 @@ class Placeholders:
         if metrics := table.measured_metrics:
             rows = [
                 [
-                    row.label,
+                    _mark(row),
                     row.against,
                     *(self._compare_with_paper(name, row, mode, metric) for metric in metrics),
                 ]
@@ -179,35 +182,42 @@ class Placeholders:
     def _compare_with_paper(self, name: str, row: Row, mode: str, metric: str) -> str:
         printed = row.cells[mode][metric].paper_effect
         paper = "" if printed is None else f"; paper {printed:+.2f}".replace("-", MINUS)
-        return f"{self.effect(name, row.label, mode, metric)}{paper}"
+        return f"{self.effect(name, row.label, mode, metric)}{_list_branches(row, mode, metric)}{paper}"
 
     def held(self, names: Sequence[str], mode: str = "stream") -> str:
         """Count verdicts on the paper's effects, and list them in a table with a row for each variant.
 
-        Only effects with a sign in the paper count; `-` stands for the others.
+        Only effects with a sign in the paper count; `-` stands for the others. Confounded rows count apart.
+        Verdicts in other branches than the printed one stand in parentheses.
 
         Args:
             names: the names of the tables' results.
             mode: the mode of evaluation.
         """
         metrics = list(dict.fromkeys(m for name in names for m in self._find_table(name).measured_metrics))
-        rows, counts = [], Counter[str]()
+        rows, counts = [], (Counter[Verdict](), Counter[Verdict]())
         for name in names:
             table = self._find_table(name)
+            for confounded, found in enumerate(counts):
+                found.update(table.count_verdicts(mode, bool(confounded)))
             for row in (row for row in table.rows if row.found and row.against):
                 cells = [
-                    self.verdict(name, row.label, mode, metric)
+                    self.verdict(name, row.label, mode, metric) + _list_branches(row, mode, metric)
                     if metric in table.measured_metrics and row.cells[mode][metric].paper_effect
                     else MISSING
                     for metric in metrics
                 ]
-                counts.update(cells)
                 if set(cells) != {MISSING}:
                     link = f"[{table.number or name}]({name}.md)"
-                    rows.append([link, row.label, row.against or "", *cells])
-        verdicts = {str(verdict): counts[str(verdict)] for verdict in Verdict}
-        words = ", ".join(f"{verdict} {count}" for verdict, count in verdicts.items() if count)
-        total = f"Of {sum(verdicts.values())} effects with a sign in the paper, in {mode} mode: {words}."
+                    rows.append([link, _mark(row), row.against or "", *cells])
+        sound, apart = counts
+        total = (
+            f"Of {sound.total()} effects with a sign in the paper, in {mode} mode: {format_counts(sound)}."
+        )
+        if apart:
+            total += (
+                f" {apart.total()} confounded effects ({CONFOUNDED}) count apart: {format_counts(apart)}."
+            )
         return f"{total}\n\n{_make_markdown_table(['table', 'variant', 'compared with', *metrics], rows)}"
 
     def steps(self, name: str, mode: str = "stream") -> str:
@@ -238,7 +248,7 @@ class Placeholders:
         return _make_markdown_table(["step", *metrics], rows)
 
     def decided(self, name: str, *patterns: str) -> str:
-        """Return how many of a table's differences are significant: `53 of 148`.
+        """Return how many of a table's differences are significant: `53 of 148`; confounded rows count apart.
 
         Args:
             name: the name of the table's results.
@@ -249,10 +259,12 @@ class Placeholders:
             if regroup is None:
                 raise InputError(f"{name}: decided must have no patterns; these clips cannot be regrouped")
             table = regroup(patterns)
-        cells = (cell for row in table.rows for metrics in row.cells.values() for cell in metrics.values())
-        counts = Counter(cell.effect.verdict for cell in cells if cell.effect and cell.effect.verdict)
-        significant = counts.total() - counts[Verdict.INCONCLUSIVE] - counts[Verdict.EQUIVALENT]
-        return f"{significant} of {counts.total()}"
+        counts = (Counter[bool](), Counter[bool]())
+        undecided = (Verdict.INCONCLUSIVE, Verdict.EQUIVALENT)
+        for row, *_, effect in (one for mode in table.modes for one in table.list_effects(mode)):
+            counts[bool(row.confounded)][effect.verdict not in undecided] += 1
+        sound, apart = (f"{found[True]} of {found.total()}" for found in counts)
+        return f"{sound}, and {apart} confounded" if counts[1] else sound
 
     def _find_table(self, name: str) -> Table:
         _check_name("results", name, self.sources)
@@ -264,6 +276,23 @@ class Placeholders:
         _check_name("mode", mode, rows[variant].cells)
         _check_name(f"metric of {name}", metric, rows[variant].cells[mode])
         return rows[variant].cells[mode][metric]
+
+
+def _mark(row: Row) -> str:
+    return f"{row.label} {CONFOUNDED}" if row.confounded else row.label
+
+
+def _list_branches(row: Row, mode: str, metric: str) -> str:
+    """Return the differences and verdicts in other branches: ` (rotation +0.69 opposite)`."""
+    effects = {branch: by_mode[mode].get(metric) for branch, by_mode in row.branches.items()}
+    cell = row.cells[mode][metric]
+    words = [
+        f"{branch} {' '.join(format_branch_effect(effect, cell)).replace('*', '')}"
+        for branch, effect in effects.items()
+        if effect
+    ]
+    words += [f"{branch} not recorded" for branch in row.unrecorded]
+    return f" ({', '.join(words)})" if words else ""
 
 
 def _make_markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -49,6 +49,7 @@ class Variant:
             for the seeds of the sweep.
         series: the variant's label in the file, without the overrides of the axes.
         cell: the overrides that the axes add, one per key; empty without axes.
+        confounded: the other differences from the control that the label does not name; None without any.
     """
 
     label: str
@@ -61,6 +62,7 @@ class Variant:
     seeds: tuple[int, ...] | None = None
     series: str = ""
     cell: tuple[str, ...] = ()
+    confounded: str | None = None
 
     @property
     def own_overrides(self) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ variants:
   2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
   "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
   "4": {overrides: ['memory.layers=[4]'], branch: rotation, against: "2"}     # its own branch and control
+  other: {overrides: [model=agrol_mlp], confounded: the loss changes too}     # its verdicts count apart
 axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, in which each variant is repeated
 axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or several grids
 """
@@ -47,7 +48,7 @@ KEYS = (
     "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",
     "variants", "axes",
 )  # fmt: skip
-VARIANT_KEYS = ("overrides", "branch", "against", "paper", "note")
+VARIANT_KEYS = ("overrides", "branch", "against", "paper", "note", "confounded")
 BASE = "base"  # the variant's label in a sweep without variants and grids
 
 
@@ -158,7 +159,7 @@ def _parse_variant(label: str, value: Any, branch: str) -> Variant:
     if isinstance(value, list):
         return Variant(label, tuple(_parse_overrides(value, name)), branch)
     value = _parse_mapping(value or {}, name, VARIANT_KEYS)
-    overrides = value.get("overrides", [])
+    overrides, confounded = value.get("overrides", []), value.get("confounded")
     return Variant(
         label,
         None if overrides is None else tuple(_parse_overrides(overrides, f"{name}.overrides")),
@@ -167,6 +168,7 @@ def _parse_variant(label: str, value: Any, branch: str) -> Variant:
         value.get("note"),
         str(value["against"]) if value.get("against") is not None else None,
         "branch" in value,
+        confounded=None if confounded is None else _parse_text(confounded, f"{name}.confounded"),
     )
 
 

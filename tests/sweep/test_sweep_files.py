@@ -7,6 +7,8 @@ errors' definitions imply.
 
 from __future__ import annotations
 
+import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from omegaconf import OmegaConf
 
 from memmlp.config.compose import compose_config
 from memmlp.runs.identity import flatten
+from memmlp.sweep.definition import COSTS
 from memmlp.sweep.sweep_file import load_sweep
 
 FOLDER = Path(__file__).parent.parent.parent / "sweeps"
@@ -94,6 +97,39 @@ def test_values_are_those_printed():
 
 
 AFTER_IK = {"MPJPE": 3.08, "Jitter": 6.03}  # Table 6, "Rotation + Position Branch"
+
+
+OF_NETWORKS = {"networks", "paper_size", "recurrent_poser", "smooth_motion", "table01", "table02", "table03"}
+"""Sweeps whose labels name whole networks, with their losses and features."""
+OF_SEVERAL = {
+    "no Multi-Head, no Memory-Block, Mem-MLP's loss": 2, "+ Mem-MLP's backbone": 4,
+    "no memory, as many parameters": 2, "no memory, as many frames": 2,
+    "windows of 41 frames, 32 a step": 2,
+}  # fmt: skip
+"""The numbers of components that labels name, where it is not one."""
+
+
+@pytest.mark.slow
+def test_a_row_that_changes_more_than_its_label_names_is_confounded():
+    """Without a position branch there is no hand term and no inverse kinematics, so they do not count."""
+    for path in FILES:
+        sweep = load_sweep(path)
+        if path.stem in OF_NETWORKS | {"mix"} or set(sweep.metrics) <= set(COSTS):
+            continue
+        sweep = replace(sweep, base=tuple(text for text in sweep.base if not text.startswith("data=")))
+        flat = functools.cache(
+            lambda overrides: flatten(OmegaConf.to_container(compose_config([*overrides]), resolve=True))
+        )
+        variants = {variant.label: variant for variant in sweep.list_runnable()}
+        for label, variant in variants.items():
+            control = sweep.find_control(variant)
+            if control and variants[control].cell == variant.cell:
+                one, other = (flat(sweep.merge_overrides(row)) for row in (variant, variants[control]))
+                keys = {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}
+                changed = {key.split(".")[0] for key in keys} - {"evaluation", "seed"}
+                changed -= {"hand"} if "predictor" in changed and "model" not in changed else set()
+                several = len(changed) > OF_SEVERAL.get(label, 1)
+                assert several == bool(variant.confounded), (path.stem, label, changed)
 
 
 DECOMPOSITION = load_sweep(FOLDER / "decomposition.yaml")

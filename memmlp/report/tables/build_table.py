@@ -15,6 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.report.tables.effects import (
     RunsBySeed,
+    compare_branches,
     compute_effects,
     find_control,
     find_paper_effect,
@@ -102,6 +103,9 @@ def make_table(
     comparisons = sum(effect.p is not None for effect in effects.values())
     if rounds:
         effects, comparisons = rounds.apply_verdicts(effects), len(rounds.list_comparison_keys(sweep))
+    branches = compare_branches(shown, runs, MODES) if has_errors else {}
+    if rounds:  # their numbers of seeds were chosen by verdicts on other branches
+        branches = {branch: _drop_verdicts(found) for branch, found in branches.items()}
     flags = find_flags(shown, sweep, runs, command or f"memmlp sweep {sweep.name}", describe_run)
     rows = (_make_row(shown, one, runs.get(one.label), shown_modes, effects) for one in shown.variants)
     return Table(
@@ -114,7 +118,7 @@ def make_table(
         branch_source=sweep.branch_source,
         smallest=dict(sweep.smallest),
         comparisons=comparisons,
-        rows=tuple(rows),
+        rows=tuple(_add_branches(row, runs, branches, shown_modes) for row in rows),
         notes=(*sweep.notes, *(f"{one.label}: {one.note}" for one in sweep.variants if one.note)),
         flags=(*flags, *(() if rounds else flag_early_tables(shown, runs))),
         analyses=tuple((one.seeds, one.level) for one in rounds.analyses) if rounds else (),
@@ -151,7 +155,36 @@ def _make_row(
         wanted=sweep.get_seeds(variant) if runs is not None else (),
         cells={mode: {metric: make_cell(mode, metric) for metric in sweep.metrics} for mode in modes},
         pairing=pairing,
+        confounded=variant.confounded,
     )
+
+
+def _add_branches(
+    row: Row,
+    runs: Mapping[str, RunsBySeed],
+    branches: Mapping[str, Mapping[Key, Effect]],
+    modes: Sequence[str],
+) -> Row:
+    """Return a row with its effects in other branches, and the branches that it or its control lacks."""
+    found = {
+        branch: {
+            mode: {key.metric: one for key, one in effects.items() if key[:2] == (row.label, mode)}
+            for mode in modes
+        }
+        for branch, effects in branches.items()
+    }
+    both = [run for label in (row.label, row.against or "") for run in runs.get(label, {}).values()]
+    return replace(
+        row,
+        branches={branch: by_mode for branch, by_mode in found.items() if any(by_mode.values())},
+        unrecorded=tuple(
+            one for one in branches if row.against and not all(run.has_branch(one) for run in both)
+        ),
+    )
+
+
+def _drop_verdicts(effects: Mapping[Key, Effect]) -> dict[Key, Effect]:
+    return {key: replace(one, verdict=None, p=None, holm=None, equal=None) for key, one in effects.items()}
 
 
 def make_empty_table(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:

@@ -23,7 +23,7 @@ from memmlp.report.tables.statistics import (
     estimate_paired_effects,
 )
 from memmlp.report.tables.table import MAX_TIME_RATIO, Effect, Key
-from memmlp.sweep.definition import COSTS, MODES, TIMES, Sweep, Variant
+from memmlp.sweep.definition import BRANCHES, COSTS, MODES, TIMES, Sweep, Variant
 
 RunsBySeed = Mapping[int, MeasuredRun]  # a variant's finished runs by seed
 
@@ -98,20 +98,48 @@ def pair_differences(
     return {key: pair for key, pair in found.items() if pair.matrix.size}
 
 
-def compute_effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
+def compute_effects(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str], sensitivity: bool = True
+) -> dict[Key, Effect]:
     """Return the effects of all variants, with p-values corrected for all comparisons.
 
-    Effects on costs have no p-values.
+    Effects on costs have no p-values. `sensitivity` is that of `estimate_effects`.
     """
     printed = {
         Key(variant.label, mode, metric): find_paper_effect(sweep, variant, metric)
         for variant, mode, metric in itertools.product(sweep.list_runnable(), modes, sweep.metrics)
     }
     return _compare_costs(sweep, runs, modes) | _add_verdicts(
-        estimate_effects(pair_differences(sweep, runs, modes), sweep.smallest, sensitivity=True),
+        estimate_effects(pair_differences(sweep, runs, modes), sweep.smallest, sensitivity),
         sweep.smallest,
         printed,
     )
+
+
+def compare_branches(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]
+) -> dict[str, dict[Key, Effect]]:
+    """Return the effects with variant and control in the same branch, by branch.
+
+    Comparisons that the sweep itself makes in this branch are left out, and positions of two networks without
+    a position branch. Each branch has its own correction. The paper's effect is that of the printed branch.
+    """
+    pairs = {variant.label: (variant, other) for variant, other in list_comparisons(sweep)}
+    one_branch = {
+        label: bool(runs[label]) and all(run.has_one_branch for run in runs[label].values()) for label in runs
+    }
+    found = {}
+    for branch in BRANCHES:
+        changed = replace(sweep, variants=tuple(replace(one, branch=branch) for one in sweep.variants))
+        effects = compute_effects(changed, runs, modes, sensitivity=False)
+        shown = {
+            label
+            for label, (variant, other) in pairs.items()
+            if {variant.branch, other.branch} != {branch}
+            and not (branch == "position" and one_branch[label] and one_branch[other.label])
+        }
+        found[branch] = {key: one for key, one in effects.items() if one.seeds and key.label in shown}
+    return found
 
 
 def have_same_errors(variant: Variant, other: Variant, ours: RunsBySeed, theirs: RunsBySeed) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from memmlp.report.tables.statistics import Verdict
@@ -120,6 +120,10 @@ class Row:
         wanted: the planned seeds; empty for a row with only values from the paper.
         cells: the cells by mode and metric.
         pairing: a text that describes the controls in a sweep over axes; empty for a single control.
+        branches: the effects with variant and control in another branch than the row's, by branch, mode and
+            metric. Each branch has its own correction, and the verdict refers to the paper's effect.
+        unrecorded: the branches that the runs of variant or control lack.
+        confounded: the differences from the control that the label does not name; None without any.
     """
 
     label: str
@@ -130,6 +134,9 @@ class Row:
     wanted: tuple[int, ...]
     cells: Mapping[str, Mapping[str, Cell]]
     pairing: str = ""
+    branches: Mapping[str, Mapping[str, Mapping[str, Effect]]] = field(default_factory=dict)
+    unrecorded: tuple[str, ...] = ()
+    confounded: str | None = None
 
     @property
     def is_paper_only(self) -> bool:
@@ -183,9 +190,13 @@ class Table:
                 if cell.effect is not None and cell.effect.verdict is not None:
                     yield row, metric, cell, cell.effect
 
-    def count_verdicts(self, mode: str) -> Counter[Verdict]:
-        """Count the verdicts on effects that the paper prints, in a mode."""
-        found = (effect.verdict for _, _, cell, effect in self.list_effects(mode) if cell.paper_effect)
+    def count_verdicts(self, mode: str, confounded: bool = False) -> Counter[Verdict]:
+        """Count the verdicts on effects that the paper prints, in a mode, of confounded or of other rows."""
+        found = [
+            effect.verdict
+            for row, _, cell, effect in self.list_effects(mode)
+            if cell.paper_effect and bool(row.confounded) == confounded
+        ]
         return Counter(verdict for verdict in found if verdict is not None)
 
     def find_detectable(self, mode: str, metric: str) -> float | None:

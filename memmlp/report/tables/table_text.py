@@ -7,20 +7,23 @@ import json
 import math
 import re
 import textwrap
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from rich.console import Console
 
 from memmlp.common.files import make_json_safe
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
+from memmlp.report.tables.flags import join_quoted
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table import MAX_TIME_RATIO, Cell, Row, Table
+from memmlp.report.tables.table import MAX_TIME_RATIO, Cell, Effect, Row, Table
 from memmlp.sweep.definition import COSTS
 
 COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB"}
 MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
+CONFOUNDED = "‡"  # mark of a row that differs from its control in more than its label names
 ARROWS = {"lower": "↓", "higher": "↑"}
 
 
@@ -30,7 +33,8 @@ TEX_ESCAPES = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", MINUS: "$-$",
     "↓": r"$\downarrow$", "↑": r"$\uparrow$", "✓": r"$\checkmark$", "✗": r"$\times$",
-    "²": r"\textsuperscript{2}", "³": r"\textsuperscript{3}", "<": r"$<$", ">": r"$>$",
+    CONFOUNDED: r"$\ddagger$", "²": r"\textsuperscript{2}", "³": r"\textsuperscript{3}", "<": r"$<$",
+    ">": r"$>$",
 }  # fmt: skip
 
 Line = tuple[tuple[str, ...], ...]
@@ -111,7 +115,7 @@ def make_legend(table: Table) -> list[str]:
                 f"{', '.join(parts)} seeds, which share the 5 %; (3): decided at 3 seeds, and final; means "
                 "and intervals use all seeds"
             )
-        lines += [*_explain_flips(table), *_describe_power(table)]
+        lines += [*_explain_branches(table), *_explain_flips(table), *_describe_power(table)]
     if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
         lines.append(_summarize_agreement(table))
     return lines
@@ -156,6 +160,24 @@ def _explain_verdicts(table: Table) -> str:
     )
 
 
+def _explain_branches(table: Table) -> list[str]:
+    lines = [
+        f"{CONFOUNDED} confounded, so counted apart: '{row.label}': {row.confounded}"
+        for row in table.rows
+        if row.confounded
+    ]
+    if shown := dict.fromkeys(branch for row in table.rows for branch in row.branches):
+        lines.append(
+            f"{', '.join(shown)}: differences with variant and control in this branch, verdicts corrected "
+            "over the branch's comparisons; holds and opposite refer to the paper's difference above"
+        )
+    for branch in dict.fromkeys(branch for row in table.rows for branch in row.unrecorded):
+        rows = [row.label for row in table.rows if branch in row.unrecorded]
+        every = len(rows) == sum(row.against is not None for row in table.rows)
+        lines.append(f"{branch} not recorded: {'every comparison' if every else join_quoted(rows)}")
+    return lines
+
+
 def _explain_flips(table: Table) -> list[str]:
     effects = [effect for mode in table.modes for *_, effect in table.list_effects(mode)]
     if all(effect.flips is None for effect in effects):
@@ -198,14 +220,19 @@ def _describe_power(table: Table) -> list[str]:
 
 def _summarize_agreement(table: Table) -> str:
     mode, costs = table.modes[0], set(table.metrics) & set(COSTS)
-    found = table.count_verdicts(mode)
-    counts = ", ".join(f"{found[verdict]} {verdict}" for verdict in Verdict if found[verdict])
-    summary = f"; of {sum(found.values())} effects in {mode} mode: {counts}" if found else ""
+    found, apart = table.count_verdicts(mode), table.count_verdicts(mode, confounded=True)
+    summary = f"; of {found.total()} effects in {mode} mode: {format_counts(found)}" if found else ""
+    summary += f"; {apart.total()} confounded, counted apart: {format_counts(apart)}" if apart else ""
     signs = "; of a cost by its sign" if costs else ""
     cells = [cell for row in table.rows for cells in row.cells.values() for cell in cells.values()]
     if any(cell.paper_effect and cell.effect and cell.effect.within_noise for cell in cells):
         signs += f", of a time from x {MAX_TIME_RATIO:g} on"
     return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){summary}"
+
+
+def format_counts(counts: Counter[Verdict]) -> str:
+    """Return the numbers of verdicts: `8 holds, 4 inconclusive`."""
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in Verdict if counts[verdict])
 
 
 def _make_lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
@@ -216,9 +243,13 @@ def _make_lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
         yield ((row.label,), ("paper",), *paper)
         return
     values = ((format_value(cell, metric),) for cell, metric in cells)
-    yield ((row.label,), (f"{len(row.found)}/{len(row.wanted)}",), *values)
+    label = f"{row.label} {CONFOUNDED}" if row.confounded else row.label
+    yield ((label,), (f"{len(row.found)}/{len(row.wanted)}",), *values)
     if any(cell.effect for cell, _ in cells):
         yield (("",), ("diff.",), *(format_effect(cell, metric) for cell, metric in cells))
+    for branch, by_mode in row.branches.items():
+        others = ((by_mode[mode].get(metric), cell) for cell, metric in cells)
+        yield (("",), (branch,), *(format_branch_effect(effect, cell) for effect, cell in others))
     if any(cell.paper is not None for cell, _ in cells):
         yield (("",), ("paper",), *paper)
 
@@ -259,6 +290,14 @@ def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
     numbers = {"p": effect.holm, "flips": effect.flips} if effect.flips is not None else {}
     both = [f"{name} {format_significant(p, 2)}" for name, p in numbers.items() if p is not None]
     return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict, *both
+
+
+def format_branch_effect(effect: Effect | None, cell: Cell) -> tuple[str, ...]:
+    """Return difference and verdict in another branch than the row's, for the row's cell."""
+    if effect is None:
+        return (MISSING,)
+    number, *_ = format_effect(replace(cell, effect=effect), "")
+    return (number,) if effect.verdict is None else (number, str(effect.verdict))
 
 
 def format_number(value: float) -> str:

@@ -14,12 +14,13 @@ from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of
 from fake_table import EFFECTS, cell, printed
 
 from memmlp.report.tables.build_table import make_table
-from memmlp.report.tables.effects import compute_mean_cost
+from memmlp.report.tables.effects import compute_effects, compute_mean_cost
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.statistics import Verdict, correct_by_holm, estimate_paired_effects
 from memmlp.report.tables.table import Table
+from memmlp.report.tables.table_text import make_legend
 from memmlp.runs.evaluation_file import write_report
-from memmlp.sweep.definition import Sweep
+from memmlp.sweep.definition import COSTS, Sweep
 
 
 def test_difference_is_paired_by_seed_and_clip(sweep: Sweep, tmp_path: Path):
@@ -46,6 +47,47 @@ def test_correction_is_over_all_modes_and_metrics(table: Table):
     assert table.comparisons == len(tested) == 2 * 3 + 2 * 2  # the variant "by position" has no MPJRE
     smallest = min(tested, key=lambda effect: effect.p)
     assert smallest.holm == pytest.approx(min(1, smallest.p * len(tested)))
+
+
+def test_other_branches_have_the_effects_of_their_own_table(sweep: Sweep, tmp_path: Path):
+    """Variant and control are in one branch, even if the row compares two branches."""
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS))
+    rows = {row.label: row for row in make_table(sweep, runs).rows}
+    assert set(rows["no | memory"].branches) == {"position", "combined"}
+    assert set(rows["by position"].branches) == {"rotation", "position", "combined"}
+    for branch in ("position", "combined"):
+        own = replace(sweep, variants=tuple(replace(one, branch=branch) for one in sweep.variants))
+        expected = compute_effects(own, runs, ("stream", "window"))
+        found = rows["no | memory"].branches[branch]["stream"]
+        assert found.keys() == {key.metric for key in expected if key[:2] == ("no | memory", "stream")} - {
+            *COSTS
+        }
+        for metric, effect in found.items():
+            other = expected["no | memory", "stream", metric]
+            assert (effect.mean, effect.holm, effect.verdict) == (other.mean, other.holm, other.verdict)
+    assert all(row.unrecorded == () for row in rows.values())
+
+
+def test_a_branch_that_was_not_evaluated_is_named(sweep: Sweep, tmp_path: Path):
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS, branches=("rotation", "position")))
+    table = make_table(sweep, runs)
+    row = next(row for row in table.rows if row.label == "no | memory")
+    assert (set(row.branches), row.unrecorded) == ({"position"}, ("combined",))
+    assert "combined not recorded: every comparison" in make_legend(table)
+
+
+def test_confounded_rows_are_counted_apart(sweep: Sweep, tmp_path: Path):
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS))
+    before = make_table(sweep, runs)
+    rows = tuple(
+        replace(one, confounded="the loss too" if one.label == "no | memory" else None)
+        for one in sweep.variants
+    )
+    after = make_table(replace(sweep, variants=rows), runs)
+    assert after.count_verdicts("stream").total() == 0
+    assert after.count_verdicts("stream", confounded=True) == before.count_verdicts("stream")
+    assert before.count_verdicts("stream").total() == 2
+    assert "no | memory ‡" in printed(after, 100)
 
 
 def test_what_would_have_been_found_is_so_after_the_table_s_own_correction(sweep: Sweep, tmp_path: Path):

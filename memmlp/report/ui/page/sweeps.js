@@ -140,9 +140,16 @@ function rounds(found) {
 }
 
 function results(found) {
-  const row = (one, mode) => [one.label, one.wanted.length ? `${one.found.length}/${one.wanted.length}` : 'paper', ...found.metrics.map(metric => h('td', { class: 'n' }, cell(one.cells[mode][metric], metric)))];
+  const row = (one, mode) => [one.confounded ? `${one.label} ‡` : one.label, one.wanted.length ? `${one.found.length}/${one.wanted.length}` : 'paper', ...found.metrics.map(metric => h('td', { class: 'n' }, cell(one.cells[mode][metric], metric), otherBranches(one, mode, metric)))];
   const heads = ['variant', 'seeds', ...found.metrics.map(metric => found.headings[metric])];
   return h('div', { class: 'stack' }, found.modes.map(mode => table(heads, found.rows.map(one => row(one, mode)), { kind: 'effects', scroll: 'scroll', caption: found.modes.length > 1 ? `${mode} mode` : null })));
+}
+
+// Differences and verdicts with variant and control in another branch than the row's.
+function otherBranches(row, mode, metric) {
+  const lines = Object.entries(row.branches ?? {}).map(([branch, modes]) => [branch, modes[mode]?.[metric]]).filter(([, effect]) => effect);
+  const digits = effect => effectDigits({ ...effect, value: row.cells[mode][metric].mean });
+  return lines.map(([branch, effect]) => h('small', { class: 'faint branch' }, `${branch} ${signed(effect.mean, digits(effect))}${effect.verdict ? ` ${effect.verdict}` : ''}`));
 }
 
 function cell({ mean, sd, effect, paper, paper_effect: paperEffect }, metric) {
