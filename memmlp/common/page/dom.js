@@ -52,10 +52,6 @@ export function empty(title, ...children) {
   return h('div', { class: 'empty' }, h('p', { class: 'lead' }, title), ...children);
 }
 
-export function code(text) {
-  return h('code', {}, text);
-}
-
 // Tell a screen reader what changed on the page.
 export function say(text) {
   document.getElementById('said').textContent = text;

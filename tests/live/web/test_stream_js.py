@@ -128,10 +128,11 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
     for name, packed in (("model.onnx", entry["play"]), ("ort.wasm", "ort/wasm.wasm.gz")):
         (folder / name).write_bytes(gzip.decompress((site.folder / packed).read_bytes()))
     page = folder / "page"
-    page.mkdir()
+    (page / "three").mkdir(parents=True)
     (page / "package.json").write_text('{"type": "module"}')
-    for name in ("onnx_stream.js", "stream.js", "rotations.js", "ort/wasm.js"):
-        (page / Path(name).name).write_bytes((site.folder / name).read_bytes())
+    for name in ("onnx_stream.js", "stream.js", "rotations.js", "three/three.core.min.js"):
+        (page / name).write_bytes((site.folder / name).read_bytes())
+    (page / "wasm.js").write_bytes((site.folder / "ort/wasm.js").read_bytes())
     job = folder / "job.json"
     job.write_text(json.dumps({"body": entry["body"], "parts": [*PARTS.values(), *map(refused, REFUSED)]}))
     files = (HERE / "play.mjs", page, page / "wasm.js", folder / "ort.wasm", folder / "model.onnx", job)

@@ -71,17 +71,17 @@ export class Stage {
     if (avatar) this.avatar.pose(frame.turns, positions, frame.hips);
     else this.prediction.pose(positions, errors ? this.heat.bind(null, errors) : () => this.grey);
     if (this.truth.group.visible) this.truth.pose(truth, () => this.grey);
-    this.follow(truth ?? positions, frame.restarted);
+    this.follow(truth ?? positions);
   }
 
-  // Move camera and light with the person's middle, smoothly except for a jump.
-  follow(joints, jump) {
+  // Move camera and light with the person's middle, smoothly except for a jump of a metre.
+  follow(joints) {
     const lowest = Math.min(...joints.filter((_, i) => i % 3 === 1));
     this.ground = Math.min(lowest, this.ground ?? lowest);
     const target = this.controls.target;
     const moved = new THREE.Vector3(joints[0], this.ground + 0.88, joints[2]).sub(target);
     const now = performance.now();
-    if (this.met && !jump) moved.multiplyScalar(1 - Math.exp(-(now - this.met) / 250));
+    if (this.met && moved.length() < 1) moved.multiplyScalar(1 - Math.exp(-(now - this.met) / 250));
     target.add(moved);
     this.camera.position.add(this.met ? moved : target.clone().add(this.front(joints)));
     this.met = now;
@@ -112,19 +112,20 @@ export class Stage {
   }
 }
 
-// A person of round limbs. A slim one hides inside another with the same pose.
+// A person of round limbs. A slim person hides inside another with the same pose.
 class Body {
   constructor(limbs, opacity, slim) {
-    const material = new THREE.MeshStandardMaterial({
-      vertexColors: true, roughness: 0.75, transparent: opacity < 1, opacity, depthWrite: opacity === 1,
-    });
+    const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.75, transparent: opacity < 1, opacity, depthWrite: opacity === 1 });
     this.limbs = limbs.map(limb => new Limb(limb, material, slim));
     this.group = new THREE.Group().add(...this.limbs.map(limb => limb.mesh));
   }
 
-  // joints: 22 positions as 66 numbers, metres; paint: (joint, other joint, part of the way) -> a colour.
+  // joints: 66 numbers, metres; paint: (joint, other joint, part of the way) -> a colour.
   pose(joints, paint) {
-    for (const limb of this.limbs) limb.pose(joints, paint);
+    for (const limb of this.limbs) {
+      limb.place(joints);
+      limb.colour(paint);
+    }
   }
 }
 
@@ -143,11 +144,6 @@ export class Limb {
     this.mesh = new THREE.Mesh(geometry, material);
     this.mesh.castShadow = slim === 1;
     this.mesh.frustumCulled = false;
-  }
-
-  pose(joints, paint) {
-    this.place(joints);
-    this.colour(paint);
   }
 
   place(joints) {

@@ -98,9 +98,6 @@ export class MirrorScene {
     this.body.visible = this.image.visible = false;
     this.showRoom(false);
   }
-
-  // The session supplies the canvas' size and the camera.
-  draw() { this.renderer.render(this.scene, this.camera); }
 }
 
 // The mirror's frame, and a film that makes the image behind it a little paler.

@@ -5,27 +5,27 @@
 // person in T-pose who looks along -Z. A sample is { time, positions, rotations } of head, left and right wrist. `run` does
 // one frame of the full graph (memmlp.live.trackers_to_body_graph); its caller is a page, a worker or node.
 
-import { aboutVertical, headingOf, IDENTITY, inverse, matrix, minus, multiply, plus, rotate, slerp, turnedBy } from './rotations.js';
+import { aboutVertical, headingOf, IDENTITY, inverse, matrix, minus, multiply, plus, rotate, slerp } from './rotations.js';
 
 const TRACKERS = ['head', 'left', 'right'];
 const EACH = [0, 1, 2];
 const GAP = 0.5; // seconds without a sample after which everything restarts
-const RECOVERY = 0.2; // seconds over which a tracker that returns is led to its true pose
-const EARLY = 5e-4; // seconds that a frame may be ahead of its sample, for times that are rounded to milliseconds
-const FURTHEST = 1.1; // of the way between two samples; two that arrive together do not show a speed
-const SAME = 1e-6; // seconds; a sample this near to a frame is taken as the frame
-const FARTHEST = 1e6; // metres; a tracker farther from the origin is taken as lost
+const RECOVERY = 0.2; // seconds over which a returning tracker moves to its true pose
+const EARLY = 5e-4; // seconds that a frame may be ahead of its sample, for times in whole milliseconds
+const MAX_WEIGHT = 1.1; // of the way between two samples; two that arrive together do not show a speed
+const SAME = 1e-6; // seconds; a sample this near to a frame is the frame
+const FARTHEST = 1e6; // metres; a tracker farther from the origin is lost
 const FAR = 0.25; // metres; a device farther from a T-pose's joint is not attached there
-const UNIT = 1e-2; // how far a quaternion's norm may be from 1
-const APART = 0.1; // metres between the hands, at least, in a T-pose
+const UNIT = 1e-2; // maximum difference of a quaternion's norm from 1
+const APART = 0.1; // minimum metres between the hands in a T-pose
 const TILTED = Math.PI / 3; // from upright; a device that is tilted further has no heading
 const NEUTRAL = { position: [0, 0, 0], rotation: IDENTITY, lost: true };
 
 const scaled = (vector, factor) => vector.map(x => factor * x);
 
-// The trackers at a time, interpolated between the samples before and after it, or extrapolated up to FURTHEST.
+// The trackers at a time, interpolated between two samples, or extrapolated up to MAX_WEIGHT.
 function interpolate(a, b, time) {
-  const weight = Math.min((time - a.time) / (b.time - a.time), FURTHEST);
+  const weight = Math.min((time - a.time) / (b.time - a.time), MAX_WEIGHT);
   return {
     time,
     positions: EACH.map(i => plus(a.positions[i], minus(b.positions[i], a.positions[i]), weight)),
@@ -40,7 +40,7 @@ function tPose(body, place, heading) {
   return { time: 0, positions, rotations: EACH.map(() => turn) };
 }
 
-// Return the sample with lost trackers at their last poses relative to the head.
+// The sample with lost trackers at their last poses relative to the head.
 function holdLost(sample, lost, last) {
   const [positions, rotations] = [[...sample.positions], [...sample.rotations]];
   if (lost[0]) [positions[0], rotations[0]] = [last.positions[0], last.rotations[0]];
@@ -68,8 +68,7 @@ class TrackerFrames {
 
   get next() { return this.origin + this.count / this.fps; }
 
-  // The frames that are due with a sample, and whether everything restarts with it. Without a time, the sample is the
-  // next frame. lost: which of head, left and right wrist are lost.
+  // The frames that are due with a sample, and whether it restarts everything. Without a time, the sample is the next frame.
   take(time, positions, rotations, lost) {
     time ??= this.next;
     const later = this.last ? time - this.last.time : Infinity;
@@ -89,7 +88,7 @@ class TrackerFrames {
     return { frames, restarted };
   }
 
-  // The sample with lost trackers filled in, and with returning ones on their way to their true poses.
+  // The sample with lost trackers filled in, and returning trackers on their way to their true poses.
   fill(sample, lost) {
     const last = this.last ?? this.standIn(sample, lost);
     const returning = EACH.filter(i => this.lost[i] && !lost[i]);
@@ -104,7 +103,7 @@ class TrackerFrames {
       sample = {
         time: sample.time,
         positions: EACH.map(i => plus(sample.positions[i], this.shift[i], share[i])),
-        rotations: EACH.map(i => multiply(turnedBy(this.turn[i], share[i]), sample.rotations[i])),
+        rotations: EACH.map(i => multiply(slerp(IDENTITY, this.turn[i], share[i]), sample.rotations[i])),
       };
     }
     this.lost = lost;
@@ -112,8 +111,8 @@ class TrackerFrames {
     return this.last;
   }
 
-  // A stand-in for the sample before the first: itself, if no tracker is lost; else the T-pose under the head; without a
-  // head, that of a person who stands at the origin and looks along +Z.
+  // What precedes the first sample: the sample itself if no tracker is lost, else a T-pose under the head; without a head, at
+  // the origin looking along +Z.
   standIn(sample, lost) {
     if (!lost.includes(true)) return sample;
     if (lost[0]) return tPose(this.body, [0, this.body.rest[0][1] - this.body.floor, 0], Math.PI);
@@ -141,10 +140,9 @@ export class Stream {
     this.newest = (this.newest ?? Promise.resolve()).then(forget, forget);
   }
 
-  // Take one sample, { position, rotation } of each tracker or null where it is lost, at a time in seconds of any clock;
-  // without one, exactly one frame after the last. Resolves to the newest frame's pose: { time, positions, rotations,
-  // joints, held, fresh, restarted }, positions by forward kinematics, joints of the network's position branch. Samples
-  // may be given before the last one's pose is there; they are processed in turn.
+  // Take one sample, { position, rotation } of each tracker or null if it is lost, at a time in seconds of any clock; without
+  // a time, one frame after the last. Resolves to the newest frame's pose: { time, positions, rotations, joints, held, fresh,
+  // restarted }, positions by forward kinematics, joints of the network's position branch. Samples are processed in turn.
   step(head, left, right, time = null) {
     if (time !== null && !Number.isFinite(time)) throw new Error(`time=${time}: must be a number of seconds, or null`);
     const devices = [head, left, right].map(read);

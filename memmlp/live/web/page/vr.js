@@ -131,7 +131,7 @@ class VrPage {
       this.calibrate(trackers);
       this.feed(trackers, time / 1000);
     }
-    mirror.draw();
+    mirror.renderer.render(mirror.scene, mirror.camera); // the session supplies the canvas' size and the camera
   }
 
   count(time) {

@@ -1,7 +1,7 @@
 // From the address to a page, and the bar above all pages.
 
 import { h, replace, link, empty, say } from './dom.js';
-import { connection, follow, listen, load, place } from './store.js';
+import { follow, inFile, load, place } from './store.js';
 import * as runs from './runs.js';
 import * as run from './run.js';
 import * as sweeps from './sweeps.js';
@@ -44,10 +44,8 @@ async function show() {
   }
 }
 
-function status() {
-  const element = document.getElementById('status');
-  element.className = connection();
-  element.textContent = { live: 'live', gone: 'not connected', connecting: 'connecting', file: 'a file' }[connection()];
+function showStatus(text, className = '') {
+  Object.assign(document.getElementById('status'), { textContent: text, className });
 }
 
 addEventListener('hashchange', show);
@@ -59,13 +57,12 @@ addEventListener('keydown', event => {
   filter.focus();
   filter.select();
 });
-listen(what => {
-  status();
-  if (what === 'news') current?.update?.();
-});
 
-status();
+showStatus(inFile ? 'a file' : 'connecting');
 await load().catch(error => replace(content, empty('The runs cannot be shown.', h('p', {}, error.message))));
 await show();
 document.documentElement.dataset.ready = '';
-follow();
+follow((connected, changed) => {
+  showStatus(...(connected ? ['live', 'live'] : ['not connected', 'gone']));
+  if (changed) current?.update?.();
+});

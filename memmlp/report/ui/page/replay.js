@@ -42,7 +42,7 @@ export class Replay {
       if (asked !== this.asked) return;
       const comparable = theirs?.frames === mine.frames && theirs.from === mine.from;
       const shown = [[run, mine], ...(comparable ? [[other, theirs]] : [])];
-      Object.assign(this, { run, mine, shown, loop: mine.worst[0], time: mine.worst[0].first / mine.fps, playing: !still.matches });
+      Object.assign(this, { run, mine, shown, playing: !still.matches });
       this.layout();
       if (other && !comparable) this.place.append(h('p', { class: 'faint' }, `${nameOf(other)}: ${theirs.reason ?? 'its clip has another motion'}`));
       this.animate(asked);
@@ -74,32 +74,25 @@ export class Replay {
     this.tick = requestAnimationFrame(tick);
   }
 
-  // First and last time, seconds, of the piece, or of its looped second.
-  get span() {
-    const { mine, loop } = this;
-    const [low, high] = [mine.from / mine.fps, (mine.from + mine.joints.length - 1) / mine.fps];
-    return loop ? [Math.max(loop.first / mine.fps, low), Math.min(loop.first / mine.fps + 1, high)] : [low, high];
-  }
-
   forward(seconds) {
-    const [start, end] = this.span;
     this.time += seconds;
-    if (this.time >= end) { this.time = start; this.jumped = true; }
+    if (this.time >= this.loop[1]) [this.time] = this.loop;
   }
 
   layout() {
     const { mine, shown, body } = this;
     const frames = mine.joints.length;
+    this.whole = [mine.from / mine.fps, (mine.from + frames - 1) / mine.fps];
     this.top = Math.max(...shown.map(([, data]) => data.top));
     const panels = [['Truth', null], ...shown.map(([one, data]) => [nameOf(one), data])].map(([name, data]) => {
       const canvas = h('canvas', { 'aria-label': `${name} in 3D` });
       const error = h('b', { class: 'n' });
       return { data, canvas, error, element: h('div', { class: 'view' }, h('div', { class: 'view-stage' }, canvas), h('p', { class: 'view-name' }, h('span', {}, name), data ? [error, ' cm'] : null)) };
     });
-    const piece = (loop, ...text) => ({ loop, button: h('button', { type: 'button', class: 'small', onclick: () => this.repeat(loop) }, text) });
+    const piece = (loop, ...text) => ({ loop, button: h('button', { type: 'button', class: 'small', onclick: () => { this.playing = true; this.repeat(loop); } }, text) });
     this.pieces = [
-      ...mine.worst.map((one, i) => piece(one, `${i ? `${i + 1}.` : 'Worst second'} at ${number(one.first / mine.fps, 1)} s: `, h('b', {}, number(one.mean, 1)), ' cm')),
-      piece(null, frames < mine.frames ? `${Math.round(frames / mine.fps)} s around it` : 'Whole clip'),
+      ...mine.worst.filter(one => one.first >= mine.from && one.first < mine.from + frames).map((one, i) => piece([one.first / mine.fps, one.first / mine.fps + 1], `${i ? `${i + 1}.` : 'Worst second'} at ${number(one.first / mine.fps, 1)} s: `, h('b', {}, number(one.mean, 1)), ' cm')),
+      piece(this.whole, frames < mine.frames ? `${Math.round(frames / mine.fps)} s around it` : 'Whole clip'),
     ];
     this.play = h('button', { type: 'button', class: 'primary', onclick: () => { this.playing = !this.playing; } });
     this.slider = h('input', { type: 'range', 'aria-label': 'Time in the clip', min: mine.from, max: mine.from + frames - 1, step: 1, oninput: event => this.go(event.target.valueAsNumber / mine.fps) });
@@ -116,26 +109,19 @@ export class Replay {
     }
     for (const view of this.views) view.stage.controls.addEventListener('start', () => { this.leader = view; });
     this.leader = this.views[0];
-    this.jumped = true;
-    this.mark();
+    this.repeat(this.pieces[0].loop);
   }
 
-  // Play one of the worst seconds again and again; null for the whole piece.
+  // Play from a start to an end, seconds, again and again.
   repeat(loop) {
     this.loop = loop;
-    if (loop) { this.playing = true; this.go(loop.first / this.mine.fps); }
-    this.mark();
-  }
-
-  mark() {
-    for (const { loop, button } of this.pieces) button.setAttribute('aria-pressed', String(this.loop === loop));
+    [this.time] = loop;
+    for (const piece of this.pieces) piece.button.setAttribute('aria-pressed', String(piece.loop === loop));
   }
 
   go(time) {
-    if (this.loop && (time < this.loop.first / this.mine.fps || time > this.loop.first / this.mine.fps + 1)) { this.loop = null; this.mark(); }
-    const [low, high] = this.span;
-    this.time = Math.min(Math.max(time, low), high);
-    this.jumped = true;
+    if (time < this.loop[0] || time > this.loop[1]) this.repeat(this.whole);
+    this.time = Math.min(Math.max(time, this.loop[0]), this.loop[1]);
   }
 
   press(event) {
@@ -152,7 +138,7 @@ export class Replay {
     const index = Math.min(Math.max(Math.round(this.time * mine.fps) - mine.from, 0), mine.joints.length - 1);
     for (const { data, stage, error } of this.views) {
       const frame = measureErrors(data ? { positions: data.joints[index], truth: mine.truth[index] } : { positions: mine.truth[index] });
-      stage.show({ ...frame, restarted: this.jumped });
+      stage.show(frame);
       if (data) error.textContent = number(frame.mean, 1);
     }
     for (const { stage } of this.views) { // all cameras follow that of the stage that was touched last
@@ -162,7 +148,6 @@ export class Replay {
       }
       stage.draw();
     }
-    this.jumped = false;
     if (document.activeElement !== this.slider) this.slider.value = index + mine.from;
     this.clock.textContent = `${this.time.toFixed(2)} s`;
     this.play.textContent = this.playing ? 'Pause' : 'Play';

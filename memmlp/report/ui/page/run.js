@@ -1,6 +1,6 @@
 // A run: results beside the control's, worst seconds in 3D, curves, clips, config, latency, files.
 
-import { h, replace, link, section, select, choice, code, table } from './dom.js';
+import { h, replace, link, section, select, choice, table } from './dom.js';
 import { address, ask, dataName, inFile, nameOf, place, remember, runs } from './store.js';
 import { ago, ARROWS, better, bytes, date, duration, effectDigits, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
 import { curvePanel } from './curves.js';
@@ -55,8 +55,8 @@ function warnings(run) {
 
 function facts(run) {
   return pairs([
-    ['id', code(run.id)], ['started', h('span', { title: ago(run.started) }, date(run.started))], ['took', duration(run.seconds)],
-    ['data', code(dataName(run.data) || '–')], ['device', run.device || '–'], ['code', code(run.code || '–')],
+    ['id', h('code', {}, run.id)], ['started', h('span', { title: ago(run.started) }, date(run.started))], ['took', duration(run.seconds)],
+    ['data', h('code', {}, dataName(run.data) || '–')], ['device', run.device || '–'], ['code', h('code', {}, run.code || '–')],
     run.prerequisite && ['prerequisite', link(address('run', run.prerequisite), run.prerequisite.slice(0, 8))],
     run.control && ['control', [link(address('run', run.control.id), nameOf(run.control)), ' · ', link(address('compare', '', { runs: `${run.id},${run.control.id}` }), 'compare')]],
   ].filter(Boolean), 'facts');

@@ -1,6 +1,6 @@
 // The table of runs: filter, sort, the columns in which they differ, tags and notes; and chosen runs with their curves.
 
-import { h, replace, link, section, empty, code, say } from './dom.js';
+import { h, replace, link, section, empty, say } from './dom.js';
 import { about, address, dataName, nameOf, place, remember, runs } from './store.js';
 import { parse, matches } from './filter.js';
 import { curvePanel } from './curves.js';
@@ -65,7 +65,7 @@ export async function page(name, route) {
   const table = h('table', { class: 'runs' });
   const more = h('button', { type: 'button', class: 'more', onclick: () => { ui.drawn += STEP * 4; body(); } });
   const compare = h('a', { class: 'button', 'aria-disabled': 'true' }, 'Compare');
-  const columns = h('details', { class: 'menu' }, h('summary', { class: 'button' }, 'Columns'), h('div', { class: 'panel' }));
+  const columns = h('select', { 'aria-label': 'Add or remove a column', onchange: () => toggleColumn(columns.value) });
   const set = changes => { remember(changes); draw(); };
   const filter = h('input', {
     type: 'search', id: 'filter', spellcheck: false, autocomplete: 'off', placeholder: 'memory=gru stream.MPJPE<6.3, or words',
@@ -74,8 +74,6 @@ export async function page(name, route) {
   const kind = h('select', { 'aria-label': 'Kind of runs', onchange: () => set({ kind: kind.value === 'memmlp' ? '' : kind.value || 'all' }) }, KINDS.map(([value, text]) => h('option', { value }, text)));
   const scroll = h('div', { class: 'scroll tall' }, table, more);
   const nothing = h('div');
-  const closeMenu = event => { if (columns.open && !columns.contains(event.target)) columns.open = false; };
-  addEventListener('click', closeMenu);
   new IntersectionObserver(([entry]) => { if (entry.isIntersecting && !more.hidden) more.click(); }, { root: scroll, rootMargin: '600px' }).observe(more);
 
   function draw() {
@@ -104,7 +102,7 @@ export async function page(name, route) {
   }
 
   function noMatch(settings) {
-    return empty('No run matches.', h('p', {}, 'Filter: ', code(settings.text || settings.status || 'kind')), h('button', { type: 'button', onclick: () => set({ filter: '', status: '', kind: 'all' }) }, 'Show all runs'));
+    return empty('No run matches.', h('p', {}, 'Filter: ', h('code', {}, settings.text || settings.status || 'kind')), h('button', { type: 'button', onclick: () => set({ filter: '', status: '', kind: 'all' }) }, 'Show all runs'));
   }
 
   function noRuns() {
@@ -179,17 +177,18 @@ export async function page(name, route) {
   }
 
   function menu() {
-    const box = (name, text = name) => h('label', { title: name }, h('input', { type: 'checkbox', checked: ui.columns.includes(name), onchange: event => {
-      const next = event.target.checked ? [...ui.columns, name] : ui.columns.filter(one => one !== name);
-      const order = [...ui.auto, ...about.keys, ...about.metrics];
-      set({ cols: [...new Set(next)].sort((a, b) => order.indexOf(a) - order.indexOf(b)).join('|') });
-    } }), text);
-    const panel = columns.querySelector('.panel');
-    const top = panel.scrollTop;
+    if (document.activeElement === columns) return; // it may be open
+    const option = (name, text = name) => h('option', { value: name }, ui.columns.includes(name) ? `✓ ${text}` : text);
     const others = about.keys.filter(key => !ui.auto.includes(key));
-    replace(panel, h('button', { type: 'button', onclick: () => set({ cols: '' }) }, 'Default'), h('h3', {}, 'Differing keys'), ui.auto.map(key => box(key)),
-      others.length ? h('h3', {}, 'Other keys') : null, others.map(key => box(key)), h('h3', {}, 'Measured'), about.metrics.map(name => box(name, metricText(name))));
-    panel.scrollTop = top;
+    replace(columns, h('option', { value: '' }, 'Columns'), h('option', { value: 'default' }, 'Default columns'),
+      [...ui.auto, ...others].map(key => option(key)), about.metrics.map(name => option(name, metricText(name))));
+  }
+
+  function toggleColumn(name) {
+    columns.blur();
+    const next = ui.columns.includes(name) ? ui.columns.filter(one => one !== name) : [...ui.columns, name];
+    const order = [...ui.auto, ...about.keys, ...about.metrics];
+    set({ cols: name === 'default' ? '' : next.sort((a, b) => order.indexOf(a) - order.indexOf(b)).join('|') });
   }
 
   function selection() {
@@ -214,7 +213,7 @@ export async function page(name, route) {
     await panel?.update();
   }
   await update();
-  return { title, element, update: () => { update(); say(`${ui.list.length} runs`); }, close: () => removeEventListener('click', closeMenu) };
+  return { title, element, update: () => { update(); say(`${ui.list.length} runs`); } };
 }
 
 export const tags = run => run.tags.map(tag => h('span', { class: 'tag' }, tag));

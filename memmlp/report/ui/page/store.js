@@ -8,10 +8,8 @@ export const generated = answers?.about ?? '';
 export const runs = new Map();
 export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', state: '' };
 const PAUSE = 1000; // milliseconds between two questions for changes
-const listeners = new Set();
 let dataNames = new Map();
 let ambiguous = new Set(); // names of runs on several data sets
-let state = inFile ? 'file' : 'connecting';
 
 // The answer to a question such as 'run/0123...'. Throws an Error with the server's message.
 export async function ask(path) {
@@ -62,17 +60,10 @@ function readable(row) {
   return { ...row, config, cells, metrics, text: words.join('\n').toLowerCase() };
 }
 
-export const connection = () => state;
-export const listen = listener => listeners.add(listener);
-
-// Ask the server for changes again and again.
-export async function follow() {
-  if (inFile) return;
-  const notify = what => { for (const listener of listeners) listener(what); };
-  for (;;) {
-    const [next, changed] = await load().then(news => ['live', news], () => ['gone', false]);
-    if (next !== state) { state = next; notify('state'); }
-    if (changed) notify('news');
+// Ask the server for changes again and again. update(connected, changed): called with each answer.
+export async function follow(update) {
+  while (!inFile) {
+    await load().then(changed => update(true, changed), () => update(false, false));
     await new Promise(done => setTimeout(done, PAUSE));
   }
 }
