@@ -30,20 +30,21 @@ export class Replay {
     this.views = [];
   }
 
-  // Show a run's clip in a mode, beside the truth and beside another run.
-  async show(run, clip, mode, other) {
+  // Show a run's clip in a mode, beside the truth and beside another run, at a second; null for the worst second.
+  async show(run, clip, mode, other, second = null) {
     const asked = ++this.asked;
     this.stop();
     replace(this.place, h('p', { class: 'wait' }, 'Computing the networks’ predictions for this clip; the first time takes some seconds.'));
     try {
       this.body ??= await ask('body');
-      const mine = await this.fetch(asked, run.id, clip, mode);
+      const mine = await this.fetch(asked, run.id, clip, mode, second === null ? undefined : Math.max(second - 4.5, 0));
       const theirs = other && await this.fetch(asked, other.id, clip, mode, mine.from / mine.fps).catch(error => ({ reason: error.message }));
       if (asked !== this.asked) return;
       const comparable = theirs?.frames === mine.frames && theirs.from === mine.from;
       const shown = [[run, mine], ...(comparable ? [[other, theirs]] : [])];
       Object.assign(this, { run, mine, shown, playing: !still.matches });
-      this.layout();
+      this.showAt = moment => this.show(run, clip, mode, other, moment);
+      this.layout(second);
       if (other && !comparable) this.place.append(h('p', { class: 'faint' }, `${nameOf(other)}: ${theirs.reason ?? 'its clip has another motion'}`));
       this.animate(asked);
     } catch (error) {
@@ -79,7 +80,7 @@ export class Replay {
     if (this.time >= this.loop[1]) [this.time] = this.loop;
   }
 
-  layout() {
+  layout(second) {
     const { mine, shown, body } = this;
     const frames = mine.joints.length;
     this.whole = [mine.from / mine.fps, (mine.from + frames - 1) / mine.fps];
@@ -89,9 +90,9 @@ export class Replay {
       const error = h('b', { class: 'n' });
       return { data, canvas, error, element: h('div', { class: 'view' }, h('div', { class: 'view-stage' }, canvas), h('p', { class: 'view-name' }, h('span', {}, name), data ? [error, ' cm'] : null)) };
     });
-    const piece = (loop, ...text) => ({ loop, button: h('button', { type: 'button', class: 'small', onclick: () => { this.playing = true; this.repeat(loop); } }, text) });
+    const piece = (loop, ...text) => ({ loop, button: h('button', { type: 'button', class: 'small', onclick: () => this.start(loop) }, text) });
     this.pieces = [
-      ...mine.worst.filter(one => one.first >= mine.from && one.first < mine.from + frames).map((one, i) => piece([one.first / mine.fps, one.first / mine.fps + 1], `${i ? `${i + 1}.` : 'Worst second'} at ${number(one.first / mine.fps, 1)} s: `, h('b', {}, number(one.mean, 1)), ' cm')),
+      ...mine.worst.slice(0, inFile ? 1 : undefined).map((one, i) => piece([one.first / mine.fps, one.first / mine.fps + 1], `${i ? `${i + 1}.` : 'Worst second'} at ${number(one.first / mine.fps, 1)} s: `, h('b', {}, number(one.mean, 1)), ' cm')),
       piece(this.whole, frames < mine.frames ? `${Math.round(frames / mine.fps)} s around it` : 'Whole clip'),
     ];
     this.play = h('button', { type: 'button', class: 'primary', onclick: () => { this.playing = !this.playing; } });
@@ -109,7 +110,14 @@ export class Replay {
     }
     for (const view of this.views) view.stage.controls.addEventListener('start', () => { this.leader = view; });
     this.leader = this.views[0];
-    this.repeat(this.pieces[0].loop);
+    this.repeat((this.pieces.find(({ loop }) => loop[0] === second) ?? this.pieces[0]).loop);
+  }
+
+  // Play a piece, after loading it if the loaded frames do not contain it.
+  start(loop) {
+    if (loop[0] < this.whole[0] || loop[0] > this.whole[1]) return this.showAt(loop[0]);
+    this.playing = true;
+    this.repeat(loop);
   }
 
   // Play from a start to an end, seconds, again and again.
