@@ -43,7 +43,7 @@ class BestWeights:
                 self.weights = {name: one.detach().clone() for name, one in self.module.state_dict().items()}
 
     def write_into_module(self) -> None:
-        """Write the kept weights into the module; without any, the module is unchanged."""
+        """Write the kept weights into the module. Without kept weights, the module is not changed."""
         if self.weights:
             self.module.load_state_dict(self.weights)
 

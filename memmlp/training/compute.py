@@ -71,7 +71,7 @@ def _use_plain_kernels() -> Iterator[None]:
     """Compute attention and recurrent layers by plain matrix products, and skip compiled code."""
     with ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
-        warnings.simplefilter("ignore")  # of oneDNN, about Intel's GPUs
+        warnings.simplefilter("ignore")  # oneDNN warns about Intel GPUs
         stack.enter_context(sdpa_kernel(SDPBackend.MATH))
         stack.enter_context(torch.backends.mkldnn.flags(enabled=False))
         stack.enter_context(torch.backends.cudnn.flags(enabled=False))

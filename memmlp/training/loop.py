@@ -66,7 +66,7 @@ class TrainingTask:
         return {}
 
     def average_over_draws(self, measure: Callable[[], float]) -> float:
-        """Return the mean of a step's measure, if the number of network calls in a step is random."""
+        """Return the expected value of `measure`, a number that depends on random draws of a step."""
         return measure()
 
     def validate(self) -> dict[str, float]:

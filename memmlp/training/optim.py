@@ -48,12 +48,12 @@ class OptimSettings(Settings):
     """The keys that all optimisers have."""
 
     steps: int = setting(at_least(1), "${profile.steps}")
-    # training compute in TFLOP, with prerequisite runs; it sets the number of steps. null: `steps` does
+    # training compute, TFLOP, including prerequisite runs; it determines `steps`. null: `steps` is used
     tflop: float | None = setting(positive(), None)
     batch: int = setting(at_least(1), "${profile.batch}")  # number of windows per step
     lr: float = setting(positive(), "${profile.lr}")
     weight_decay: float = setting(at_least(0), 1.0e-4)
-    # number of initial steps with a growing learning rate, or below 1 a fraction of the steps; 0: none
+    # number of initial steps with a growing learning rate; below 1: a fraction of all steps; 0: none
     warmup: int | float = setting(steps_or_fraction(), 0)
     clip_norm: float = setting(at_least(0), 0.0)  # maximum norm of the gradient; 0: no limit
     precision: str = setting(one_of("fp32", "bf16"), "fp32")
@@ -61,9 +61,9 @@ class OptimSettings(Settings):
     checkpoint_every: int = setting(
         at_least(1), "${profile.checkpoint_every}"
     )  # number of steps between checkpoints
-    # number of steps between validations, or below 1 a fraction of the steps
+    # number of steps between validations; below 1: a fraction of all steps
     validate_every: int | float = setting(steps_or_fraction(zero=False), "${profile.validate_every}")
-    # rotation or position: keep the weights with the lowest validation MPJPE of this branch; null: the last
+    # rotation or position: the weights with this branch's lowest validation MPJPE are kept; null: the last
     best_by: str | None = setting(one_of("rotation", "position"), None)
     log_every: int = setting(
         at_least(1), "${profile.log_every}"

@@ -56,7 +56,7 @@ class Rollout(nn.Module):
         """Store the state after a training step for later steps; by default nothing is stored."""
 
     def average_over_draws(self, measure: Callable[[], float]) -> float:
-        """Return the mean of a training step's measure, if the rollout draws the number of network calls."""
+        """Return the expected value of `measure`, a number that depends on the rollout's random draws."""
         return measure()
 
 
@@ -120,13 +120,13 @@ class OwnPredictions(Rollout):
         return TrainingCall(sparse[:, -stride:], state, stretch[:, -model.frames :], clips)
 
     def average_over_draws(self, measure: Callable[[], float]) -> float:
-        """Return the mean of a measure that grows linearly with the number of calls."""
-        found = 0.0
+        """Return the expected value of `measure`, which must be linear in the number of network calls."""
+        total = 0.0
         for passes in (0, self.max_passes):
             self.passes = passes
-            found += measure() / 2
+            total += measure() / 2
         self.passes = None
-        return found
+        return total
 
 
 @component("rollout", "streams", version=2, builds="PersistentStreams")

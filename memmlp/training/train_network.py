@@ -190,7 +190,7 @@ class MotionTask(TrainingTask):
         return StepResult(sum(own.values(), loss), terms | own, call.clips)
 
     def average_over_draws(self, measure: Callable[[], float]) -> float:
-        """Return the mean of a step's measure over the rollout's draws; see Rollout."""
+        """Return the expected value of `measure` over the rollout's draws; see Rollout."""
         return self.rollout.average_over_draws(measure)
 
     def report(self) -> dict[str, float]:

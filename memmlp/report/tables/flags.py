@@ -365,7 +365,7 @@ def _flag_unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iter
 
 
 def _flag_missed_budgets(every: LabelledRuns) -> Iterator[str]:
-    """Flag trainings with another compute than `optim.tflop` asks for, since their steps are few."""
+    """Flag trainings whose compute differs from `optim.tflop`, because a few steps cannot match it."""
     missed = {
         label: f"'{label}' {run.training['tflop']:.3g} instead of {budget:g}"
         for label, run in every

@@ -16,7 +16,7 @@ startup: 10                         # the number of random trials before TPE; nu
 seed: 0                             # the sampler's seed
 pruner: median                      # median: stops a trial worse than the median of earlier trials; none
 prune_after: 5                      # the number of finished trials before pruning; null with pruner: none
-tflop: null                         # the compute of each training, TFLOP; null: steps set its length
+tflop: null                         # training compute of each run, TFLOP; null: optim.steps sets the length
 storage: null                       # null: a journal in the search's folder; or a storage URL for Optuna
 """
 
