@@ -6,16 +6,29 @@ import copy
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
+from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.training.optim import Optim
 
-if TYPE_CHECKING:
-    from memmlp.training.loop import TrainingTask
+
+class MeasurableTask(Protocol):
+    """A training task (`memmlp.training.loop.TrainingTask`)."""
+
+    module: nn.Module
+
+    def parameter_groups(self) -> list[dict]:
+        """Return the optimiser's parameter groups."""
+
+    def step(self, step: int) -> Any:
+        """Compute the loss of a training step."""
+
+    def average_over_draws(self, measure: Callable[[], float]) -> float:
+        """Return the expected value of `measure`."""
 
 
 class StepCompute(NamedTuple):
@@ -35,10 +48,10 @@ class StepCompute(NamedTuple):
         return (self.network + self.optimiser) / 1e12
 
 
-def measure_step(task: TrainingTask, optim: Optim) -> StepCompute:
-    """Count the FLOPs of a training step, by taking one. The task's module is unchanged afterwards.
+def measure_step(task: MeasurableTask, optim: Optim) -> StepCompute:
+    """Count the FLOPs of a training step by taking a step, then restore the module.
 
-    The count does not depend on the device: kernels that hide their products are switched off.
+    The count does not depend on the device: kernels that hide their matrix products are switched off.
     """
     before = copy.deepcopy(task.module.state_dict())
     task.module.train()
@@ -54,10 +67,10 @@ def measure_step(task: TrainingTask, optim: Optim) -> StepCompute:
         optim.build(groups).step()
 
     with _use_plain_kernels():
-        found = StepCompute(task.average_over_draws(lambda: _count(take_step)), _count(step_copy))
+        compute = StepCompute(task.average_over_draws(lambda: _count(take_step)), _count(step_copy))
     task.module.load_state_dict(before)
     task.module.zero_grad(set_to_none=True)
-    return found
+    return compute
 
 
 def _count(call: Callable[[], None]) -> int:
