@@ -139,12 +139,12 @@ def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
 
 def describe_stages(outcome: Outcome) -> str:
     """Return a line that lists the stages of this call and the stages that were finished before."""
-    if not outcome.made:
+    if not outcome.new_stages:
         return f"run {outcome.run.id} is finished already; nothing was done (force=true repeats it)"
     stages = [stage for stage in STAGES if stage != "deployment" or "latency" in outcome.results]
-    before = [stage for stage in stages if stage not in outcome.made]
+    before = [stage for stage in stages if stage not in outcome.new_stages]
     ending = f"; {' and '.join(before)} done before" if before else ""
-    return f"run {outcome.run.id}: {', '.join(outcome.made)} done{ending}"
+    return f"run {outcome.run.id}: {', '.join(outcome.new_stages)} done{ending}"
 
 
 def make_source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:

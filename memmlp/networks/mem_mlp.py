@@ -66,15 +66,15 @@ class StreamingBlock(nn.Module):
             newest: whether to compute only the newest frame's output (1, d).
         """
 
-        def take(window: Tensor) -> Tensor:
+        def pick(window: Tensor) -> Tensor:
             return window[-1:] if newest else window
 
         mix = self.time_mix
-        h = take(h) + F.silu(torch.addmm(take(mix.bias), take(mix.weight), self.time_norm(h)))
+        h = pick(h) + F.silu(torch.addmm(pick(mix.bias), pick(mix.weight), self.time_norm(h)))
         linear = self.linear(self.norm(h))
         if self.index is None:
             return h + F.silu(linear)
-        contribution = take(contributions[self.index])
+        contribution = pick(contributions[self.index])
         if self.plain:
             return self.merge(h + F.silu(linear)) + contribution
         return h + F.silu(linear + contribution)

@@ -102,8 +102,8 @@ def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> tuple[s
     if len(every) > MAX_FILES or len(set(every)) != len(every) or not ID.fullmatch(run_id):
         raise InputError(f"{path}: must be an archive with one run folder, named by 16 hex digits")
     for name in every:
-        folder, _, own = name.partition("/")
-        if folder != run_id or not ALLOWED.fullmatch(own):
+        folder, _, file = name.partition("/")
+        if folder != run_id or not ALLOWED.fullmatch(file):
             raise InputError(f"{path}: {name!r} is not a file of run {run_id}")
     if (total := sum(one.file_size for one in archive.infolist())) > max_size:
         raise InputError(

@@ -82,20 +82,20 @@ class RunRequest:
         only the keys of its architecture have an effect.
         """
         config, codes = self.config, find_vqvae_training(self.config)
-        own = {key: value for key, value in config.items() if key != "vqvae"}
+        network_config = {key: value for key, value in config.items() if key != "vqvae"}
         if codes == "joint":
-            own["vqvae"] = {key: config["vqvae"][key] for key in VQVAE_SHAPE}
+            network_config["vqvae"] = {key: config["vqvae"][key] for key in VQVAE_SHAPE}
         if config["refiner"] is not None:
             bare = remove_refiner(config)
-            return [*RunRequest(bare, self.motion)._run_chain, (NETWORK, own)]
+            return [*RunRequest(bare, self.motion)._run_chain, (NETWORK, network_config)]
         prerequisite: Any = find_chosen_settings(config, "prerequisite")
         if prerequisite is not None:
-            return [*prerequisite.prerequisites(config), (NETWORK, own)]
+            return [*prerequisite.prerequisites(config), (NETWORK, network_config)]
         if codes == "frozen":
             vqvae = {"normalizer": config["normalizer"], "vqvae": config["vqvae"]}
             vqvae |= {"data": {"mirror": True}} if config["data"].get("mirror") else {}
-            return [("vqvae", vqvae), (NETWORK, own)]
-        return [(NETWORK, own)]
+            return [("vqvae", vqvae), (NETWORK, network_config)]
+        return [(NETWORK, network_config)]
 
 
 def find_vqvae_training(config: Mapping[str, Any]) -> str | None:
@@ -114,13 +114,13 @@ class Outcome:
 
     Attributes:
         run: the network's run.
-        made: the stages that this call ran, out of "training", "evaluation" and "deployment".
+        new_stages: the stages that this call ran, out of "training", "evaluation" and "deployment".
         results: mode -> branch -> metric, and "latency".
         stage_ids: the ids of the evaluations and the deployment that the results come from.
     """
 
     run: Run
-    made: tuple[str, ...]
+    new_stages: tuple[str, ...]
     results: dict[str, Any]
     stage_ids: tuple[str, ...]
 
@@ -194,7 +194,7 @@ def read_clip_rows(request: RunRequest, run: Run) -> list[dict[str, Any]]:
 def list_data_remarks(data: PreparedMotion) -> list[str]:
     """Return the warnings about the data to print before a run begins."""
     manifest = data.manifest
-    found = (
+    remarks = (
         describe_skipped_files(manifest.skipped),
         describe_unusual_clips(manifest.unusual),
         describe_low_rates(manifest, manifest.clips, "clips"),
@@ -202,7 +202,7 @@ def list_data_remarks(data: PreparedMotion) -> list[str]:
         describe_unmatched_patterns(manifest.split, [clip.name for clip in manifest.clips]),
         None if data.has("val") else "no validation clips, so trainings are not validated (data.split.val)",
     )
-    return list(filter(None, found))
+    return list(filter(None, remarks))
 
 
 def describe_test_clips(clips: Sequence[ClipRecord]) -> str:
@@ -274,10 +274,10 @@ def collect_data_warnings(config: Mapping[str, Any], data: PreparedMotion) -> di
 
 def describe_missing_data(config: Mapping[str, Any], data: PreparedMotion) -> str | None:
     """Describe missing data of the protocol or of the training groups; None if the data is complete."""
-    own, manifest = config["data"], data.manifest
-    coverage, found = manifest.coverage, manifest.listed or (*manifest.left_out, *manifest.groups)
-    fraction = own["split"].get("train_fraction", 1)
+    data_config, manifest = config["data"], data.manifest
+    coverage, subsets = manifest.coverage, manifest.listed or (*manifest.left_out, *manifest.groups)
+    fraction = data_config["split"].get("train_fraction", 1)
     parts = [] if coverage.is_complete else [str(coverage)]
-    parts += [absent] if (absent := describe_absent_subsets(own["name"], found)) else []
+    parts += [absent] if (absent := describe_absent_subsets(data_config["name"], subsets)) else []
     parts += [f"{100 * fraction:g} % of its training groups"] if fraction < 1 else []
-    return ", ".join([own["name"], *parts]) if parts else None
+    return ", ".join([data_config["name"], *parts]) if parts else None

@@ -141,19 +141,19 @@ def run_experiment(experiment: Experiment, on_validation: ValidationCallback | N
     with run.lock():
         if config["force"]:
             run.reset()
-        made = []
+        new_stages = []
         with record_outcome(experiment, run):
             if not run.done:
                 # Another process may have restarted the run in the meantime.
                 before = before or make_prerequisites(experiment, data)
                 train_run(experiment, run, data, before, on_validation)
-                made.append("training")
-            made += make_missing_stages(experiment, run, data)
+                new_stages.append("training")
+            new_stages += make_missing_stages(experiment, run, data)
         if folder := config["save_predictions"]:
             model = experiment.architecture.load(run.weights()).to(experiment.device)
             test = data.open("test").to(experiment.device)
             save_predictions(experiment.evaluation, model, test, Path(folder))
-    return Outcome(run, tuple(made), read_results(experiment, run), experiment.stage_ids)
+    return Outcome(run, tuple(new_stages), read_results(experiment, run), experiment.stage_ids)
 
 
 def complete_stages(
@@ -173,8 +173,8 @@ def complete_stages(
     with run.lock(), record_outcome(experiment, run, again):
         if again:
             evaluate_run(experiment, run, data, experiment.evaluation.modes)
-        made = [*(["evaluation"] if again else []), *make_missing_stages(experiment, run, data)]
-    return read_results(experiment, run), made
+        new_stages = [*(["evaluation"] if again else []), *make_missing_stages(experiment, run, data)]
+    return read_results(experiment, run), new_stages
 
 
 def make_missing_stages(experiment: Experiment, run: Run, data: PreparedMotion) -> list[str]:
@@ -183,17 +183,17 @@ def make_missing_stages(experiment: Experiment, run: Run, data: PreparedMotion) 
     Returns:
         The names of the stages that were run.
     """
-    made = []
+    new_stages = []
     run.request_stages(experiment.stage_ids)
     if missing := list_missing_modes(experiment, run):
         if any(run.has(experiment.evaluations[mode]) for mode in missing):
             announce("evaluation: the code of custom metrics has changed, so they are measured again")
         evaluate_run(experiment, run, data, missing)
-        made.append("evaluation")
+        new_stages.append("evaluation")
     if experiment.deployment_id and not run.has(experiment.deployment_id):
         deploy_run(experiment, run, data)
-        made.append("deployment")
-    return made
+        new_stages.append("deployment")
+    return new_stages
 
 
 def make_prerequisites(experiment: Experiment, data: PreparedMotion, last: str | None = None) -> Run | None:

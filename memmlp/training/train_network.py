@@ -182,12 +182,14 @@ class MotionTask(TrainingTask):
     def step(self, step: int) -> StepResult:
         """Compute the loss of a training step."""
         call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
-        motion, state, own = self.compute_training_outputs(call.sparse, call.state, call.true_frames)
+        motion, state, losses = self.compute_training_outputs(call.sparse, call.state, call.true_frames)
         self.rollout.keep(state)
         members = len(motion) // len(call.true_frames)  # a network may return the motion of several
-        true = call.true_frames[:, -motion.shape[1] :].repeat(members, 1, 1)
-        loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.normalizer)
-        return StepResult(sum(own.values(), loss), terms | own, call.clips)
+        truth = call.true_frames[:, -motion.shape[1] :].repeat(members, 1, 1)
+        loss, terms = self.loss(
+            motion, truth[..., SPARSE_DIM:], truth[..., :SPARSE_DIM], self.model.normalizer
+        )
+        return StepResult(sum(losses.values(), loss), terms | losses, call.clips)
 
     def average_over_draws(self, measure: Callable[[], float]) -> float:
         """Return the expected value of `measure` over the rollout's draws; see Rollout."""

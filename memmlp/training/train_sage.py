@@ -143,9 +143,9 @@ class SAGEPrerequisiteSettings(Settings):
         same = ("checkpoint_every", "log_every", "precision")
         often = {name: getattr(network.optim, name) for name in same}
         for kind in PARTS:
-            own = getattr(self, kind)
+            keys = getattr(self, kind)
             betas = (0.9, 0.99) if kind in ("upper_codes", "lower_codes") else (0.9, 0.999)
-            optim = DroppingOptim(**own, **often, betas=betas, validate_every=own["steps"])
+            optim = DroppingOptim(**keys, **often, betas=betas, validate_every=keys["steps"])
             make = SAGEDecoderTraining if kind == "decoder" else SAGEPartTraining
             yield make(kind, replace(network, optim=optim))
 
@@ -297,8 +297,8 @@ def compute_code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training
     hidden[:, codes.joints[0]] = False
     shown = sixd.masked_fill(hidden[:, None, :, None], HIDDEN) if training else sixd
     latent, codebook = codes.encode(shown.flatten(-2), encoded)
-    made = codes.decode(latent)[:, -1].unflatten(-1, (-1, 6))
-    errors = measure_half_errors(net, codes.joints, made, frames[:, -1], sixd[:, -1])
+    decoded = codes.decode(latent)[:, -1].unflatten(-1, (-1, 6))
+    errors = measure_half_errors(net, codes.joints, decoded, frames[:, -1], sixd[:, -1])
     return {name: CODE_WEIGHTS[name] * term for name, term in (errors | {"codebook": codebook}).items()}
 
 

@@ -259,7 +259,7 @@ def find_shared_stretches(
     """
 
     @lru_cache(maxsize=16)
-    def turns(index: int) -> np.ndarray:
+    def read_rotations(index: int) -> np.ndarray:
         clip = read_clip(root / clips[index].file, clips[index].name)
         return compute_local_rotations(resample(clip, interpolation=LINES)[0])
 
@@ -276,8 +276,8 @@ def find_shared_stretches(
         pair = min(one, two), max(one, two)
         if one >= len(clips) or pair in done or clips[one].content == clips[two].content:
             continue
-        seen = mirror_rotations(turns(two)) if mirrored else turns(two)
-        if _has_same_rotations(turns(one), frames[mark], seen, frames[other]):
+        seen = mirror_rotations(read_rotations(two)) if mirrored else read_rotations(two)
+        if _has_same_rotations(read_rotations(one), frames[mark], seen, frames[other]):
             done.add(pair)
             yield clips[pair[0]], clips[pair[1]]
 

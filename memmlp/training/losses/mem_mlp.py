@@ -125,10 +125,10 @@ class MotionLoss(Loss):
         normalizer = Normalizer.from_coordinates(World(), torch.zeros(N_JOINTS, 3))
         motion = probe[..., SPARSE_DIM:]
         probed = motion, motion, probe[..., :SPARSE_DIM], normalizer
-        own = dict.fromkeys(self._compute_custom_term(*probed), self.term.weight)
-        if twice := own.keys() & self._compute_paper_terms(*probed).keys():
+        custom_weights = dict.fromkeys(self._compute_custom_term(*probed), self.term.weight)
+        if twice := custom_weights.keys() & self._compute_paper_terms(*probed).keys():
             raise InputError(f"term: '{min(twice)}' must have another name, since this name is in use")
-        weighting.build(list(self.terms(*probed)), own)
+        weighting.build(list(self.terms(*probed)), custom_weights)
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         paper = self._compute_paper_terms(motion, truth, sparse, normalizer)
