@@ -21,14 +21,14 @@ SPACE = {
 }
 
 
-def search(**changes: Any) -> Search:
+def search(best: Mapping[str, Value] | None = None, **changes: Any) -> Search:
     content: dict[str, Any] = {
         "name": "mine", "base": ["loss=manual"], "space": {"loss": SPACE}, "objectives": ["MPJPE"],
         "n_trials": 6, "seeds": 1, "sampler": "tpe", "startup": 3, "seed": 0, "pruner": "none",
-        "tflop": None,
+        "tflop": None, "after": None,
         "prune_after": 2, "storage": None,
     }  # fmt: skip
-    return parse_search({**content, **changes})
+    return parse_search({**content, **changes}, best)
 
 
 def open_study(folder: Path, **changes: Any) -> Study:

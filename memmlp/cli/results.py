@@ -223,3 +223,33 @@ def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence
         *([f"made with earlier component versions: {', '.join(changed)}"] if changed else []),
     ]
     return replace(table, flags=(*table.flags, *flags))
+
+
+@results.command("searches")
+@click.argument("folders", nargs=-1, type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("searches"),
+    show_default=True,
+    help="Folder for trials.csv and summary.md.",
+)
+@outputs_option
+def searches(folders: tuple[Path, ...], out: Path, outputs: Path) -> None:
+    """Write the trials and the best trials of finished searches.
+
+    FOLDERS are those of searches; by default, all finished searches below the outputs folder. trials.csv has
+    a row for each trial, summary.md a row for each search.
+    """
+    from memmlp.common.files import atomic_write
+    from memmlp.sweep.search.earlier_searches import format_summary, format_trials, read_search
+
+    chosen = folders or sorted(path.parent for path in (outputs / "tune").glob("*/trials.csv"))
+    if not chosen:
+        raise InputError(f"{outputs / 'tune'}: has no finished searches; run memmlp tune")
+    found = [read_search(folder.absolute()) for folder in chosen]
+    out.mkdir(parents=True, exist_ok=True)
+    atomic_write(out / "trials.csv", format_trials(found))
+    summary = "\n".join(format_summary(found))
+    atomic_write(out / "summary.md", f"{summary}\n")
+    click.echo(summary)

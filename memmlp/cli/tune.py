@@ -56,7 +56,8 @@ def tune(
         show(setup)
         return
     with Lock(setup.folder).hold():
-        write_json(setup.folder / "search.json", asdict(setup.search))
+        about = {**asdict(setup.search), "command_line": setup.command_line}
+        write_json(setup.folder / "search.json", about)
         study = Study.open(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)
         write_results(setup, study)
@@ -110,6 +111,7 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     from memmlp.common.files import digest
     from memmlp.config.compose import compose_plain
     from memmlp.config.plugins import activate, find_named_packages
+    from memmlp.sweep.search.earlier_searches import BestTrial, read_best_trial
     from memmlp.sweep.search.search_file import parse_search
 
     activate(find_named_packages(overrides))
@@ -118,13 +120,17 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     if not isinstance(content, dict):
         raise InputError("search: must be the name of a file in conf/search")
     activate(find_named_packages(map(str, content.get("base") or ())))
-    parsed = parse_search(content)
+    best = BestTrial()
+    if isinstance(folder := content.get("after"), str):
+        best = read_best_trial(Path(folder))
+        content["base"] = [*best.overrides, *content["base"]]
+    parsed = parse_search(content, best.values)
     remaining = tuple(text for text in overrides if text not in own)
     setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
     base = _check_space(setup)
     if not _make_requests(setup, {})[0].motion.prepare().has("val"):
         raise InputError("data.split.val: must be above 0 for a search, which ranks trials on validation")
-    counted = {**asdict(parsed), "n_trials": None, "storage": None}
+    counted = {**asdict(parsed), "n_trials": None, "after": None, "storage": None}
     return setup._replace(folder=outputs / "tune" / f"{parsed.name}-{digest([base, counted])[:8]}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from hydra.core.object_type import ObjectType
@@ -9,12 +10,19 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.common.components import SLOTS, collect_attribute, find_component, list_component_names
+from memmlp.common.components import (
+    SLOTS,
+    collect_attribute,
+    find_chosen_settings,
+    find_component,
+    list_component_names,
+)
 from memmlp.common.settings import SIZES
 from memmlp.config.schema import ONLY, SCHEMAS
 
 SCHEME = "components"
 SCHEMA = "schema"
+WIDTHS = re.compile(r"(model|memory)\.(width|code_width|feedforward)")
 GROUPS = (*SLOTS, "generator", "loggers")
 
 
@@ -85,14 +93,24 @@ def _load_option(group: str, name: str) -> tuple[str | None, DictConfig]:
     return "_global_", cfg
 
 
-def _choose_size(tiny: Any, small: Any, paper: Any, width_fraction: float = 0, *, _root_: DictConfig) -> Any:
+def _choose_size(
+    tiny: Any, small: Any, paper: Any, width_fraction: float = 0, *, _root_: DictConfig, _node_: Any
+) -> Any:
+    chosen = (tiny, small, paper)[SIZES.index(_root_.profile.sizes)]
     if width_fraction and _root_.profile.width is not None:
-        return round(width_fraction * _root_.profile.width)
-    return (tiny, small, paper)[SIZES.index(_root_.profile.sizes)]
+        chosen = width_fraction * _root_.profile.width
+    if WIDTHS.fullmatch(_node_._get_full_key(None)):
+        return round(chosen * _root_.profile.scale)
+    return chosen
 
 
 def _choose_reading(default: Any, literal: Any, *, _root_: DictConfig) -> Any:
     return literal if _root_.profile.reading == "literal" else default
+
+
+def _choose_movement(weight: float, *, _root_: DictConfig) -> float | None:
+    one_frame = getattr(find_chosen_settings(_root_, "model"), "learns_newest_frame", False)
+    return None if one_frame else weight
 
 
 def _list_even_layers(depth: int) -> list[int]:
@@ -106,4 +124,5 @@ def register_components() -> None:
     Plugins.instance().register(ComponentSource)
     OmegaConf.register_new_resolver("size", _choose_size, replace=True)
     OmegaConf.register_new_resolver("reading", _choose_reading, replace=True)
+    OmegaConf.register_new_resolver("movement", _choose_movement, replace=True)
     OmegaConf.register_new_resolver("even_layers", _list_even_layers, replace=True)

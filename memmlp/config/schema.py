@@ -165,6 +165,8 @@ class ProfileConfig:
     # the width of the hidden states of Mem-MLP and AGRoL; the memory's width is proportional to it. null: the
     # width that `sizes` sets
     width: int | None = setting(at_least(1), None)
+    # factor on the network's declared widths: width, code_width and feedforward of model and memory
+    scale: float = setting(positive(), 1.0)
     synth_minutes: float | None = setting(positive(), None)
     steps: int = setting(at_least(1))
     batch: int = setting(at_least(1))

@@ -295,7 +295,9 @@ def select_training_config(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def affects_training(key: str, config: Mapping[str, Any]) -> bool:
     """Return whether a dotted key of this config can change the training or the data."""
-    return key.startswith("data.") or any(_is_below(name, [key]) for name in select_training_config(config))
+    if key.startswith(("data.", "profile.")):  # the profile's keys act through other groups
+        return True
+    return any(_is_below(name, [key]) for name in select_training_config(config))
 
 
 def select_validation_config(config: Mapping[str, Any]) -> dict[str, Any]:

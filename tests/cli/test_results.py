@@ -116,3 +116,9 @@ def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):
     memmlp("results", "save", "14")
     assert one_line(memmlp("results", *arguments), *words)
+
+
+def test_finished_searches_are_needed(memmlp: Memmlp):
+    assert one_line(memmlp("results", "searches"), "outputs/tune: has no finished searches")
+    Path("other").mkdir()
+    assert one_line(memmlp("results", "searches", "other"), "other: must be the folder of a finished search")

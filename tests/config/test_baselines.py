@@ -107,7 +107,6 @@ REFUSED = [
     (["loss=terms"], "loss=terms"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),
     (["model=agrol_mlp", "loss=terms", "loss.jerks=1"], "loss.jerks"),
-    (["model=avatar_poser", "loss=kinematic"], "loss.velocity: must be null"),
     (["model=manikin_s", "loss=terms", "loss.contact=1"], "loss.contact: must be null"),
     (["model=sage", "loss=terms", "loss.jerk=1"], "loss.jerk: must be null"),
     (["model=hmd_poser", "model.frames=3", "loss=calm"], "loss.velocity_3: must be null"),
@@ -132,3 +131,16 @@ def test_an_impossible_combination_is_one_line():
 def test_arms_that_a_refiner_has_moved_may_reach_again():
     cfg = compose_config(["model=recurrent_poser", "refiner=sage", "evaluation.ik=arms"])
     assert (cfg.model.output, cfg.evaluation.ik) == ("reaching", "arms")
+
+
+def test_a_scale_multiplies_the_widths_of_any_network():
+    poser = compose_config(["model=avatar_poser", "profile=small", "profile.scale=2"])
+    assert (poser.model.width, poser.model.feedforward, poser.model.depth) == (128, 1024, 3)
+    mem = compose_config(["profile=small", "profile.scale=0.5", "profile.width=64"])
+    assert (mem.model.width, mem.memory.width, mem.vqvae.width) == (32, 12, 128)
+
+
+def test_the_kinematic_loss_has_no_movements_for_a_network_that_learns_one_frame():
+    one, many = (compose_config([f"model={name}", "loss=kinematic"]) for name in ("ego_poser", "rpm"))
+    assert [one.loss.velocity, one.loss.velocity_5] == [None, None]
+    assert [many.loss.velocity, many.loss.velocity_5] == [1000.0, 250.0]

@@ -11,13 +11,15 @@ from pathlib import Path
 
 import pytest
 from benchmarks import chaos
-from command_line import BRIEF, SMALL, in_folder, run
+from command_line import BRIEF, SMALL, in_folder, run, run_apart
 from processes import Forked, forked, until
 
+from memmlp.cli.tune import SearchSetup, prepare_search
 from memmlp.common.lease import current_process
 from memmlp.networks import checkpoint
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
+from memmlp.sweep.search.study import Study, journal_path
 
 QUICK = ["export.graph=off", "evaluation.modes=[stream]"]
 
@@ -113,3 +115,29 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
         f"run {'e' * 16}: other weights",
         f"run {'f' * 16} should not be",
     ]
+
+
+@pytest.mark.slow
+def test_a_killed_search_has_the_trials_of_an_undisturbed_one(tmp_path: Path):
+    """The controller of a search of fixed compute is killed during the second of four trials."""
+    small = ["profile=tiny", "data.synth.minutes=0.05", "loggers=none", "threads=1", "model=avatar_poser"]
+    words = [*small, "search=budget", "search.n_trials=4", "search.tflop=0.001"]
+    setup = prepare_search(words, None, tmp_path / "outputs")
+    with forked(in_folder, tmp_path, "tune", *words, "--workers", "1") as process:
+        journal = journal_path(setup.folder)
+        until(lambda: journal.exists() and len(view(setup).trials) == 2, "the second trial", process)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+    run_apart(tmp_path, "tune", *words, "--workers", "1")
+    undisturbed = Study.open(setup.search, "undisturbed", tmp_path)
+    expected = [undisturbed.ask().params for _ in range(4)]
+    assert [trial.params for trial in view(setup).trials] == expected
+    runs = [Run.from_id(tmp_path / "outputs", *trial.user_attrs["runs"]) for trial in view(setup).trials]
+    assert [run.manifest["tflop"] for run in runs] == pytest.approx([0.001] * 4, rel=0.05)
+    assert len({run.id for run in runs}) == 4
+
+
+def view(setup: SearchSetup) -> Study:
+    study = Study.view(setup.search, setup.folder.name, setup.folder)
+    assert study is not None
+    return study

@@ -7,7 +7,7 @@ space:                              # a tree of config keys; its leaves are rang
     rotation_all: {low: 0.1, high: 10.0, log: true, first: 1.0}
   optim:
     batch: {low: 16, high: 64, step: 16}
-  hand: {choices: ['off', fk]}
+  hand: {choices: [default, 'off']} # default: no override; a choice may go on with further overrides
 objectives: [MPJPE]                 # validation metrics to minimise; [MPJPE, Jitter] gives a Pareto front
 n_trials: 30                        # the total number of trials, also if the search is restarted
 seeds: 1                            # the number of runs per trial; the objective is their mean
@@ -17,6 +17,8 @@ seed: 0                             # the sampler's seed
 pruner: median                      # median: stops a trial worse than the median of earlier trials; none
 prune_after: 5                      # the number of finished trials before pruning; null with pruner: none
 tflop: null                         # training compute of each run, TFLOP; null: optim.steps sets the length
+after: null                         # the folder of an earlier search; its best trial is the base of all
+                                    # trials, and {factor: 3} ranges from its value / 3 to its value * 3
 storage: null                       # null: a journal in the search's folder; or a storage URL for Optuna
 """
 
@@ -35,7 +37,8 @@ from memmlp.common.settings import Rule, matching, one_of, positive
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 
 OBJECTIVE_BRANCHES = ("rotation", "position")
-RANGE_KEYS = ("low", "high", "log", "step", "choices", "first")
+RANGE_KEYS = ("low", "high", "log", "step", "choices", "first", "factor")
+DEFAULT = "default"  # the choice that leaves a key unchanged
 
 Value = float | int | str | bool | None
 
@@ -109,6 +112,7 @@ class Search:
     pruner: str
     prune_after: int | None
     tflop: float | None
+    after: str | None
     storage: str | None
 
     def list_first_trials(self) -> list[dict[str, Value]]:
@@ -131,9 +135,16 @@ class Search:
         branch = self.objectives[0].terms[0][1].split()[0]
         return f"optim.tflop={self.tflop}", f"optim.best_by={branch}", "optim.validate_every=0.1"
 
-    def overrides(self, values: Mapping[str, Value]) -> tuple[str, ...]:
+    @staticmethod
+    def overrides(values: Mapping[str, Value]) -> tuple[str, ...]:
         """Return a trial's values as overrides of `memmlp train`."""
-        return tuple(f"{key}={format_value(value)}" for key, value in values.items())
+        texts: list[str] = []
+        for key, value in values.items():
+            if isinstance(value, str) and " " in value:
+                texts += f"{key}={value}".split()
+            elif value != DEFAULT:
+                texts.append(f"{key}={format_value(value)}")
+        return tuple(texts)
 
 
 def _make_whole_number_rule(least: int) -> Rule:
@@ -150,6 +161,7 @@ def _is_text_list(value: Any) -> bool:
 RULES = {
     "name": matching(r"[\w-]{1,64}", "up to 64 letters, digits, - and _"),
     "tflop": Rule("above 0, or null", lambda value: value is None or positive().allows(value)),
+    "after": Rule("a folder, or null", lambda value: value is None or isinstance(value, str)),
     "storage": Rule("a URL, or null", lambda value: value is None or isinstance(value, str)),
     "objectives": Rule("a list of texts", _is_text_list),
     "base": Rule("a list of texts", _is_text_list),
@@ -163,8 +175,13 @@ RULES = {
 }
 
 
-def parse_search(content: Mapping[str, Any]) -> Search:
-    """Return the search that a config describes. Raises InputError for invalid content."""
+def parse_search(content: Mapping[str, Any], best: Mapping[str, Value] | None = None) -> Search:
+    """Return the search that a config describes. Raises InputError for invalid content.
+
+    Args:
+        content: the config group `search`.
+        best: the values of an earlier search's best trial, by key.
+    """
     keys = [one.name for one in fields(Search)]
     for key in content:
         if key not in keys:
@@ -179,7 +196,7 @@ def parse_search(content: Mapping[str, Any]) -> Search:
         if not allowed:
             raise InputError(f"search.{key}={values[key]}: must be {rule.words}")
     values["base"] = tuple(values["base"])
-    values["space"] = space = tuple(_parse_ranges(values["space"], ""))
+    values["space"] = space = tuple(_parse_ranges(values["space"], "", best or {}))
     values["objectives"] = objectives = tuple(map(_parse_objective, values["objectives"]))
     if not space:
         raise InputError("search.space: empty; expected config keys with low and high, or with choices")
@@ -211,24 +228,41 @@ def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
         )
 
 
-def _parse_ranges(node: Any, prefix: str) -> Iterator[Range]:
-    """Yield the ranges in a tree of keys, without keys that are null."""
+def _parse_ranges(node: Any, prefix: str, best: Mapping[str, Value]) -> Iterator[Range]:
+    """Yield the ranges in a tree of keys, without keys that are null. A group may have choices and keys."""
     if node is None:
         return
     where = f"search.space{'.' if prefix else ''}{prefix}"
     if not isinstance(node, Mapping):
         raise InputError(f"{where}: {node!r}; expected a mapping with low and high, or with choices")
-    if not set(node) & set(RANGE_KEYS):
-        for key, child in node.items():
-            yield from _parse_ranges(child, f"{prefix}.{key}" if prefix else str(key))
-        return
-    for key in node:
-        if key not in RANGE_KEYS:
+    own = {key: value for key, value in node.items() if key in RANGE_KEYS}
+    for key, child in node.items():
+        if key in own:
+            continue
+        if own and not (child is None or isinstance(child, Mapping)):
             raise InputError(f"{where}.{key}: no such key; expected one of {', '.join(RANGE_KEYS)}")
-    found = _parse_choices(prefix, node, where) if "choices" in node else _parse_interval(prefix, node, where)
+        yield from _parse_ranges(child, f"{prefix}.{key}" if prefix else str(key), best)
+    if own:
+        yield _parse_range(prefix, own, where, best)
+
+
+def _parse_range(key: str, node: Mapping[str, Any], where: str, best: Mapping[str, Value]) -> Range:
+    if "factor" in node:
+        return _parse_factor(key, node, where, best.get(key))
+    found = _parse_choices(key, node, where) if "choices" in node else _parse_interval(key, node, where)
     if found.first is not None and not found.allows(found.first):
         raise InputError(f"{where}.first={found.first}: must be within the range")
-    yield found
+    return found
+
+
+def _parse_factor(key: str, node: Mapping[str, Any], where: str, value: Value) -> Range:
+    """Return the range around the value in the best trial of `search.after`; it begins with this value."""
+    factor = _parse_number(node["factor"], f"{where}.factor")
+    if len(node) > 1 or factor <= 1:
+        raise InputError(f"{where}.factor={factor}: must be above 1, without other keys")
+    if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
+        raise InputError(f"{where}.factor: needs search.after, a search whose best trial has {key}, above 0")
+    return Range(key, value / factor, value * factor, log=True, first=float(value))
 
 
 def _parse_choices(key: str, node: Mapping[str, Any], where: str) -> Range:

@@ -22,6 +22,7 @@ GOOD: dict[str, Any] = {
     "pruner": "median",
     "prune_after": 2,
     "tflop": None,
+    "after": None,
     "storage": None,
 }
 
