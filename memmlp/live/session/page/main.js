@@ -22,7 +22,7 @@ const viewer = new Viewer([
   ['dropped', 'dropped', '', frame => frame.dropped],
   ['malformed', 'malformed', '', frame => frame.malformed],
   ['jumping', 'times jump', '', frame => (frame.jumping ? 'in seconds?' : null)],
-], showState);
+], { refresh: showState });
 document.querySelector('main').prepend(viewer.element);
 addEventListener('keydown', event => viewer.press(event));
 

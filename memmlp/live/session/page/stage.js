@@ -97,7 +97,10 @@ export class Stage {
     return START.clone().applyAxisAngle(UP, Math.atan2(-left.z, left.x));
   }
 
-  draw() {
+  // Draw the scene with the camera of a leading stage.
+  draw(leader) {
+    this.controls.target.copy(leader.controls.target);
+    this.camera.position.copy(leader.camera.position);
     const { clientWidth: width, clientHeight: height } = this.renderer.domElement.parentElement;
     const ratio = Math.min(devicePixelRatio, 2);
     if (this.width !== width || this.height !== height || this.ratio !== ratio) {

@@ -1,4 +1,4 @@
-// Frames of a body in 3D with their numbers. It pauses, goes back up to three minutes, and continues with the newest frame.
+// Frames of bodies in 3D with their numbers. It pauses, goes back up to three minutes, and continues with the newest frame.
 
 import { h, replace } from './dom.js';
 import { colourScale, measureErrors, Stage } from './stage.js';
@@ -8,11 +8,11 @@ const TIMED = 300; // newest frames whose times are summarised
 const REFRESH = 100; // milliseconds between two updates of the numbers
 
 export class Viewer {
-  // facts: see Facts; refresh(frame): called with each update of the numbers.
-  constructor(facts, refresh = () => {}) {
+  // facts: see Facts; names: of views beside each other; refresh(frame): called with each update of the numbers.
+  constructor(facts, { names = [''], refresh = () => {} } = {}) {
     Object.assign(this, { frames: [], chosen: null, refresh, refreshed: 0, failure: '' });
     this.remark = h('p', { class: 'warning', id: 'remark', hidden: true });
-    this.canvas = h('canvas', { 'aria-label': 'Truth and prediction in 3D' });
+    this.views = names.map(name => ({ name, canvas: h('canvas', { 'aria-label': `${name || 'Truth and prediction'} in 3D` }), error: h('b', { class: 'n' }) }));
     this.problem = h('p', { class: 'trouble', hidden: true });
     this.pause = h('button', { type: 'button', class: 'primary', id: 'pause', title: 'Space', onclick: () => this.togglePause() }, 'Pause');
     this.scrub = h('input', { type: 'range', id: 'scrub', min: 0, max: 0, step: 1, 'aria-label': 'Frame', oninput: () => this.choose(this.scrub.valueAsNumber) });
@@ -21,8 +21,9 @@ export class Viewer {
     this.transport = h('div', { class: 'transport' }, this.pause, this.scrub, this.time, this.newest);
     this.facts = new Facts(facts);
     this.scale = h('p', { class: 'scale', hidden: true });
-    this.element = h('div', { class: 'replay' }, this.remark,
-      h('div', { class: 'view' }, h('div', { class: 'view-stage', id: 'stage' }, this.canvas, this.problem)),
+    const panels = this.views.map(({ name, canvas, error }) =>
+      h('div', { class: 'view' }, h('div', { class: 'view-stage' }, canvas), name && h('p', { class: 'view-name' }, h('span', {}, name), error)));
+    this.element = h('div', { class: 'replay' }, this.remark, h('div', { class: `views of${names.length}`, id: 'stage' }, panels, this.problem),
       this.transport, this.facts.element, this.scale);
     this.tick = this.tick.bind(this);
     requestAnimationFrame(this.tick);
@@ -33,7 +34,11 @@ export class Viewer {
     replace(this.scale, colourScale(heat, top), h('span', { class: 'legend' }, 'truth'),
       h('span', { class: 'legend', style: `--colour: ${heat[1]}` }, 'prediction'));
     try {
-      this.stage = new Stage(this.canvas, { limbs, heat, top });
+      for (const view of this.views) {
+        view.stage = new Stage(view.canvas, { limbs, heat, top });
+        view.stage.controls.addEventListener('start', () => { this.stage = view.stage; });
+      }
+      this.stage = this.views[0].stage; // the one that was touched last; all cameras follow it
     } catch (error) {
       this.failure = `This browser does not support WebGL (${error.message}); the numbers continue.`;
       this.showProblem('');
@@ -66,7 +71,7 @@ export class Viewer {
 
   choose(number) { this.chosen = Math.min(Math.max(number, this.first), this.last); }
   resume() { this.chosen = null; }
-  togglePause() { return this.paused ? this.resume() : this.choose(this.last); }
+  togglePause() { return this.paused ? this.resume() : this.choose(this.shown?.number ?? 0); }
 
   // The space bar pauses, the arrow keys step a frame, End continues.
   press(event) {
@@ -85,12 +90,11 @@ export class Viewer {
   }
 
   tick(now) {
-    if (!this.canvas.isConnected) return;
+    if (!this.element.isConnected) return;
     const frame = this.shown;
     if (this.stage && frame) {
       const began = performance.now();
-      this.stage.show(frame);
-      this.stage.draw();
+      this.draw(frame);
       frame.drawn = performance.now() - began;
       document.documentElement.dataset.shown = frame.number;
     }
@@ -99,6 +103,15 @@ export class Viewer {
       this.showNumbers(frame);
     }
     requestAnimationFrame(this.tick);
+  }
+
+  draw(frame) {
+    this.views.forEach(({ name, stage, error }, i) => {
+      const shown = frame.views?.[i] ?? frame;
+      stage.show(shown);
+      if (name && shown.errors) error.textContent = `${shown.mean.toFixed(1)} cm`;
+    });
+    for (const { stage } of this.views) stage.draw(this.stage);
   }
 
   showNumbers(frame) {
