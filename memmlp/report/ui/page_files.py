@@ -20,7 +20,8 @@ MODULES = {
         UI_PACKAGE,
     ),
     **dict.fromkeys(
-        ("stage.js", "viewer.js", "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js"),
+        ("stage.js", "viewer.js", "three/three.module.min.js", "three/three.core.min.js",
+         "three/OrbitControls.js"),
         LIVE_PACKAGE,
     ),
     "dom.js": COMMON_PACKAGE,

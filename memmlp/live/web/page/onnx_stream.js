@@ -13,23 +13,22 @@ export class OnnxStream {
   }
 
   constructor(ort, session) {
-    Object.assign(this, { session, inputs: {}, zeros: {} });
-    for (const { name, type, shape } of session.inputMetadata) {
-      const tensor = new ort.Tensor(type, new Float32Array(shape.reduce((a, b) => a * b, 1)), shape);
-      (name.startsWith(STATE) ? this.zeros : this.inputs)[name] = tensor;
-    }
+    Object.assign(this, { session });
+    this.makers = Object.fromEntries(session.inputMetadata.map(({ name, type, shape }) =>
+      [name, (values = new Float32Array(shape.reduce((a, b) => a * b, 1))) => new ort.Tensor(type, values, shape)]));
     this.reset();
   }
 
   // A fresh start.
-  reset() { this.state = { ...this.zeros }; }
+  reset() { this.state = Object.fromEntries(Object.keys(this.makers).filter(name => name.startsWith(STATE)).map(name => [name, this.makers[name]()])); }
 
-  // One step of the inputs, arrays by name; resolves to the outputs, arrays by name.
+  close() { return this.session.release(); }
+
+  // One step of the inputs, arrays by name, which it takes over; resolves to the outputs, arrays by name.
   async step(inputs) {
-    for (const [name, values] of Object.entries(inputs)) this.inputs[name].data.set(values);
-    const made = await this.session.run({ ...this.inputs, ...this.state });
+    const tensors = Object.fromEntries(Object.entries(inputs).map(([name, values]) => [name, this.makers[name](values)]));
     const outputs = {};
-    for (const [name, tensor] of Object.entries(made)) {
+    for (const [name, tensor] of Object.entries(await this.session.run({ ...tensors, ...this.state }))) {
       if (name.endsWith(NEXT)) this.state[name.slice(0, -NEXT.length)] = tensor;
       else outputs[name] = tensor.data;
     }

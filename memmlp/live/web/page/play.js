@@ -1,7 +1,7 @@
 // Plays test clips through a network in this browser: the truth in grey, the prediction coloured by its error.
 
 import { h, replace, select } from './dom.js';
-import { fetchFile, NetworkWorker } from './network_worker.js';
+import { fetchFile, openNetwork } from './network.js';
 import { Stream } from './stream.js';
 import { Viewer } from './viewer.js';
 
@@ -11,7 +11,7 @@ const PAUSE = 1000; // milliseconds between two rounds of a clip
 export function play(page, site) {
   const player = new Player(page, site);
   player.start();
-  return () => player.stop();
+  return () => { player.round++; };
 }
 
 class Player {
@@ -45,9 +45,8 @@ class Player {
 
   // Load network and clip, and play from the start.
   async start() {
-    this.stop();
-    const { round, viewer, network } = this;
-    const worker = (this.worker = new NetworkWorker());
+    const round = ++this.round;
+    const { viewer, network } = this;
     if (!this.clips.includes(this.clip)) [this.clip] = this.clips;
     this.dropped = 0;
     this.showChoices();
@@ -56,13 +55,14 @@ class Player {
     if (!this.clip) return viewer.showProblem('This site has no test clip of this network.');
     viewer.showProblem('Loading the network.');
     try {
-      const [content] = await Promise.all([fetchFile(this.clip.file), worker.open(network.play)]);
-      viewer.showProblem('');
-      const stream = new Stream({ ...network, run: frame => worker.pose(frame) });
+      const [content, opened] = await Promise.all([fetchFile(this.clip.file), openNetwork(network.play)]);
+      if (round === this.round) viewer.showProblem('');
+      const stream = new Stream({ ...network, run: frame => opened.pose(frame) });
       while (round === this.round) {
         await this.playOnce(new Float32Array(content.buffer), stream, round);
         await sleep(PAUSE);
       }
+      await opened.close();
     } catch (error) {
       if (round === this.round) viewer.showProblem(error.message);
     }
@@ -85,7 +85,7 @@ class Player {
       const { trackers, truth } = splitFrame([...numbers.subarray(NUMBERS * frame, NUMBERS * next)]);
       const start = performance.now();
       const pose = await stream.step(...trackers, frame / fps);
-      if (pose.fresh) this.add(pose, truth, performance.now() - start);
+      if (pose.fresh && round === this.round) this.add(pose, truth, performance.now() - start);
     }
   }
 
@@ -93,11 +93,6 @@ class Player {
     const millimetres = joints => Array.from(joints, metres => 1000 * metres);
     const number = this.viewer.frames.length ? this.viewer.last + 1 : 0;
     this.viewer.add({ number, time, restarted, ms, positions: millimetres(positions), truth: millimetres(truth) });
-  }
-
-  stop() {
-    this.round++;
-    this.worker?.close();
   }
 }
 

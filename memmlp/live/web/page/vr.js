@@ -3,7 +3,7 @@
 import { h, replace, select } from './dom.js';
 import { kindsOf, trackersOf, usualOffsets } from './headset.js';
 import { MirrorScene } from './mirror_scene.js';
-import { NetworkWorker } from './network_worker.js';
+import { openNetwork } from './network.js';
 import { headingOf } from './rotations.js';
 import { Stream } from './stream.js';
 import { Facts, percentiles } from './viewer.js';
@@ -70,19 +70,16 @@ class VrPage {
 
   // Load the network, and ask the browser which modes it can enter.
   async load() {
-    this.worker?.close();
-    const worker = (this.worker = new NetworkWorker());
-    const { remark, play } = this.network;
-    this.remark.hidden = !remark;
-    this.remark.textContent = `This network is ${remark}.`;
-    try {
-      await worker.open(play);
-    } catch (error) {
-      if (worker === this.worker) this.problem.textContent = `The network did not load: ${error.message}`;
-      return;
-    }
+    const { network } = this;
+    this.remark.hidden = !network.remark;
+    this.remark.textContent = `This network is ${network.remark}.`;
+    for (const button of this.buttons) button.disabled = true;
+    const failed = error => { this.problem.textContent = `The network did not load: ${error.message}`; };
+    const opened = await openNetwork(network.play).catch(failed);
     const possible = await canEnter();
-    if (worker !== this.worker) return;
+    if (!opened || network !== this.network) return;
+    await this.opened?.close();
+    this.opened = opened;
     this.buttons.forEach((button, i) => { button.disabled = !possible[i]; });
     this.support.textContent = !window.isSecureContext ? 'This address is not secure: VR needs https or localhost.'
       : !navigator.xr ? 'This browser does not support WebXR. Open this page in a headset’s browser.'
@@ -105,9 +102,9 @@ class VrPage {
   }
 
   start(session, mode) {
-    const { mirror, worker, network } = this;
+    const { mirror, opened, network } = this;
     const height = this.measureHeight(null);
-    const stream = new Stream({ ...network, offsets: usualOffsets([null, null]), scale: network.body.height / height, run: frame => worker.pose(frame) });
+    const stream = new Stream({ ...network, offsets: usualOffsets([null, null]), scale: network.body.height / height, run: frame => opened.pose(frame) });
     this.user = {
       session, stream, height, kinds: [null, null], placed: false, calibrated: false, due: null, waiting: 0, frames: 0, skipped: 0, last: null, intervals: [], times: [],
     };
@@ -211,7 +208,7 @@ class VrPage {
 
   leave() {
     this.user?.session.end();
-    this.worker?.close();
+    this.opened?.close();
     this.mirror?.renderer.setAnimationLoop(null);
     this.mirror?.renderer.dispose();
   }
