@@ -90,7 +90,8 @@ class MotionDataset:
         device = self.frames.device
         back = torch.arange(1 - length, 1, device=device)
         frame = (end.to(device)[:, None] + back).clamp_min(0)
-        return self.frames[self.starts[clip.to(device)][:, None] + frame]
+        rows = self.starts[clip.to(device)][:, None] + frame
+        return self.frames.index_select(0, rows.flatten()).unflatten(0, rows.shape)
 
     def read_clip(self, index: int) -> Tensor:
         """Return all frames (N, 252) of a clip."""

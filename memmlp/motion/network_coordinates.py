@@ -8,14 +8,14 @@ from torch import Tensor
 
 from memmlp.common.components import component
 from memmlp.motion.body import (
-    N_JOINTS,
+    MOTION_DIM,
     POSITION,
     ROTATION,
     SPARSE_ANGULAR_VELOCITY,
+    SPARSE_DIM,
     SPARSE_POSITION,
     SPARSE_ROTATION,
     SPARSE_VELOCITY,
-    TRACKED,
 )
 
 
@@ -32,16 +32,15 @@ class Coordinates:
 
     def convert_inputs_to_local(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """Convert world inputs (..., 54) to local coordinates."""
-        position = sparse[..., SPARSE_POSITION] - _repeat_point(origin, len(TRACKED))
-        return torch.cat([sparse[..., : SPARSE_POSITION.start], position, sparse[..., SPARSE_VELOCITY]], -1)
+        return sparse - _place_points(origin, SPARSE_POSITION, SPARSE_DIM)
 
     def convert_motion_to_local(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert world motion (..., 198) to local coordinates."""
-        return torch.cat([motion[..., ROTATION], motion[..., POSITION] - _repeat_point(origin, N_JOINTS)], -1)
+        return motion - _place_points(origin, POSITION, MOTION_DIM)
 
     def convert_motion_to_world(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert local motion (..., 198) to the world."""
-        return torch.cat([motion[..., ROTATION], motion[..., POSITION] + _repeat_point(origin, N_JOINTS)], -1)
+        return motion + _place_points(origin, POSITION, MOTION_DIM)
 
     def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
         """Convert joints' global rotations (..., 6 n), 6D, from local coordinates to the world."""
@@ -122,6 +121,7 @@ def _turn_vectors(vectors: Tensor, origin: Tensor, way: int) -> Tensor:
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1).flatten(-2)
 
 
-def _repeat_point(point: Tensor, times: int) -> Tensor:
-    """Repeat a point: (..., 3) to (..., 3 * times)."""
-    return torch.cat([point] * times, -1)
+def _place_points(point: Tensor, place: slice, size: int) -> Tensor:
+    """Repeat a point (..., 3) over a slice of features, with zeros elsewhere: (..., size)."""
+    repeated = point.repeat(*[1] * (point.dim() - 1), (place.stop - place.start) // 3)
+    return F.pad(repeated, (place.start, size - place.stop))

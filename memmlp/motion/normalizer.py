@@ -92,20 +92,18 @@ class Normalizer(nn.Module):
 
     def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """Convert world inputs (..., 54) with the given origin to network space (..., 54)."""
-        return (self.coordinates.convert_inputs_to_local(sparse, origin) - self.mean[:SPARSE_DIM]) / self.std[
-            :SPARSE_DIM
-        ]
+        local = self.coordinates.convert_inputs_to_local(sparse, origin)
+        return (local - self.mean[:SPARSE_DIM]).div_(self.std[:SPARSE_DIM])
 
     def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert world motion (..., 198) with the given origin to network space (..., 198)."""
-        return (self.coordinates.convert_motion_to_local(motion, origin) - self.mean[SPARSE_DIM:]) / self.std[
-            SPARSE_DIM:
-        ]
+        local = self.coordinates.convert_motion_to_local(motion, origin)
+        return (local - self.mean[SPARSE_DIM:]).div_(self.std[SPARSE_DIM:])
 
     def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert motion (..., 198) in network space with the given origin to the world (..., 198)."""
         return self.coordinates.convert_motion_to_world(
-            motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], origin
+            (motion * self.std[SPARSE_DIM:]).add_(self.mean[SPARSE_DIM:]), origin
         )
 
     def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:

@@ -13,6 +13,21 @@ from torch.nn.modules.dropout import _DropoutNd
 from memmlp.common import distributed
 
 
+def take_newest(h: Tensor, count: int) -> Tensor:
+    """Return the newest `count` frames of (..., T, d); all frames are returned without a slice's backward."""
+    return h if count == h.shape[-2] else h[..., -count:, :]
+
+
+def add_to(h: Tensor, made: Tensor) -> Tensor:
+    """Return h + made, in the memory of `made` unless mixed precision gave them different types."""
+    return made.add_(h) if made.dtype == h.dtype else h + made
+
+
+def apply_linear(layer: nn.Linear, h: Tensor) -> Tensor:
+    """Return layer(h), for batches with the bias added in place: torch first copies it to every row."""
+    return layer(h) if h.dim() == 2 else F.linear(h, layer.weight).add_(layer.bias)
+
+
 class TimeMix(nn.Module):
     """Mixes the frames of a window by a T x T matrix, the same for every channel (Conv1d T -> T, kernel 1).
 
@@ -35,10 +50,10 @@ class TimeMix(nn.Module):
         Returns:
             (B, n, d) or (n, d); n is `newest`, or T for all frames.
         """
-        weight, bias = self.weight[-newest:], self.bias[-newest:]
+        weight, bias = (self.weight[-newest:], self.bias[-newest:]) if newest else (self.weight, self.bias)
         if h.dim() == 2:
             return torch.addmm(bias, weight, h)
-        return torch.baddbmm(bias, weight.expand(len(h), -1, -1), h)  # weight @ h + bias, in one pass
+        return torch.bmm(weight.expand(len(h), -1, -1), h).add_(bias)  # baddbmm would copy the bias first
 
 
 class MLPBlock(nn.Module):
@@ -63,8 +78,9 @@ class MLPBlock(nn.Module):
 
     def compute_newest(self, h: Tensor, count: int) -> Tensor:
         """Map (B, T, d) to the newest `count` frames (B, count, d), without computing older frames."""
-        h = h[..., -count:, :] + F.silu(self.time_mix(self.time_norm(h), count))
-        return h + F.silu(self.linear(self.norm(h)))
+        mixed = self.time_mix(self.time_norm(h), count % h.shape[-2])  # 0: all frames
+        h = add_to(take_newest(h, count), F.silu(mixed))
+        return add_to(h, F.silu(apply_linear(self.linear, self.norm(h))))
 
 
 class ResidualFusion(MLPBlock):
@@ -75,8 +91,10 @@ class ResidualFusion(MLPBlock):
 
     def fuse(self, h: Tensor, z: Tensor) -> Tensor:
         """Map the hidden state (B, T, d) and the memory feature (B, T, k) to (B, T, d)."""
-        h = h + F.silu(self.time_mix(self.time_norm(h)))
-        return h + F.silu(self.linear(torch.cat([self.norm(h), z], -1)))
+        h = add_to(h, F.silu(self.time_mix(self.time_norm(h))))
+        of_h, of_z = self.linear.weight.split([h.shape[-1], z.shape[-1]], 1)  # faster than joining h and z
+        made = F.linear(self.norm(h), of_h).add_(F.linear(z, of_z)).add_(self.linear.bias)
+        return add_to(h, F.silu(made))
 
 
 class PlainFusion(MLPBlock):

@@ -277,8 +277,10 @@ class MemMLP(MotionModel):
 
     def true_state(self, frames: Tensor) -> State:
         """Return the state after world frames [X | Theta] (B, past, 252), with true history."""
-        encoded = self.normalizer.encode(frames)
-        true = self.memory.true_state(encoded[..., :SPARSE_DIM], encoded[..., SPARSE_DIM:])
+        sparse, motion = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:]
+        origin = self.normalizer.find_origin(sparse)
+        newest = self.normalizer.encode_sparse(sparse[:, -1], origin[:, -1])
+        true = self.memory.true_state(newest, self.normalizer.encode_motion(motion, origin))
         return super().true_state(frames) | true
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:

@@ -156,7 +156,7 @@ class Memory(nn.Module):
         return {}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """Return the state after inputs (B, past, 54), with the true motion (B, past, 198) as history."""
+        """Return the state after the newest past input (B, 54), with true past motion (B, past, 198)."""
         return {}
 
     def count_needed(self, new: int) -> int:
@@ -336,8 +336,8 @@ class RecurrentMemory(FeatureMemory):
         return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """Return hidden states projected from the last of the inputs (B, past, 54), for teacher forcing."""
-        hidden = [cast(Recurrence, one).project_first_state(sparse[:, -1]) for one in self.recurrences]
+        """Return hidden states projected from the newest past input (B, 54), for teacher forcing."""
+        hidden = [cast(Recurrence, one).project_first_state(sparse) for one in self.recurrences]
         return {"hidden": torch.stack(hidden, 1).float()}
 
     def recall(self, sparse: Tensor, state: State, new: int) -> RecurrentPast:

@@ -16,6 +16,7 @@ from memmlp.common.components import component
 from memmlp.common.settings import one_of, setting, within
 from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import apply_linear
 from memmlp.networks.memory import FeatureMemory, FeatureMemorySettings, Past, Recall, RecurrentPast
 from memmlp.networks.motion_model import State
 from memmlp.networks.vqvae import VQVAE, pass_gradients_through
@@ -36,7 +37,7 @@ class Projection(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, T, size) to (B, T, k)."""
-        return F.silu(self.norm(self.linear(x)))
+        return F.silu(self.norm(apply_linear(self.linear, x)))
 
 
 class Blend(nn.Module):
@@ -85,8 +86,8 @@ class PastFeature(nn.Module):
         """Return the memory feature (B, T, k)."""
         motion = self.motion(past.motion)
         m = self.blend(motion)
-        z = self.sparse(past.sparse) + m * motion
-        return z if self.codes is None else z + (1 - m) * self.codes(past.codes)
+        own = m * motion if self.codes is None else torch.lerp(self.codes(past.codes), motion, m)
+        return self.sparse(past.sparse) + own
 
 
 class MergedProjections(nn.Module):
@@ -249,7 +250,7 @@ class OwnPastMemory(FeatureMemory):
         # but not after shift - 1: the motion of the new frames is not known yet.
         start = min(new, self.shift) - 1
         view = slice(start, start + self.frames)
-        sparse, motion = sparse[:, view], state["motion"][:, view]
+        sparse, motion = sparse[:, view].contiguous(), state["motion"][:, view].contiguous()
         return Past(sparse, motion, self.compute_code_vectors(sparse, motion))
 
     def compute_code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
@@ -257,7 +258,7 @@ class OwnPastMemory(FeatureMemory):
         raise NotImplementedError
 
     def remember(self, motion: Tensor, past: Past | RecurrentPast | None, state: State, new: int) -> State:
-        buffer = torch.cat([state["motion"], motion[:, -new:]], 1)[:, -self.past_frames :]
+        buffer = torch.cat([state["motion"][:, new:], motion[:, -new:]], 1)
         if self.history == "latest":
             buffer = torch.cat([buffer[:, : self.past_frames - self.frames], motion], 1)
         return {"motion": buffer}

@@ -14,7 +14,7 @@ from memmlp.common.components import component
 from memmlp.common.settings import Settings, at_least, setting
 from memmlp.motion.body import MOTION_DIM, ROTATION
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.layers import MLPBlock
+from memmlp.networks.layers import MLPBlock, take_newest
 
 MakeBlock = Callable[[], nn.Module]
 
@@ -42,7 +42,7 @@ class Branch(nn.Module):
             h = block(h, past)
         for last in self.blocks[-1:]:
             h = last.compute_newest(h, newest) if isinstance(last, MLPBlock) else last(h, past)
-        return self.linear(h[..., -newest:, :])
+        return self.linear(take_newest(h, newest))
 
 
 @component("predictor", "two_branch", builds="TwoBranch")

@@ -145,13 +145,12 @@ class MotionLoss(Loss):
         self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
     ) -> Terms:
         terms: Terms = {}
-        if "rotation" in self.branches:
-            error = (motion - truth)[..., ROTATION]
-            terms |= {"rotation_all": l1(error), "rotation_velocity": l1(error.diff(dim=1))}  # Eqs. 1 and 2
-        if "position" in self.branches:
-            error = joints(motion) - joints(truth)
-            steps = error[:, :, list(LOWER)].diff(dim=1)  # of the lower body only
-            terms |= {"position_branch": l1(error), "velocity_lower_body": l1(steps)}  # Eqs. 3 and 4
+        rotation, position = (motion - truth).split([ROTATION.stop, 3 * N_JOINTS], -1)
+        if "rotation" in self.branches:  # Eqs. 1 and 2
+            terms |= {"rotation_all": l1(rotation), "rotation_velocity": l1(rotation.diff(dim=1))}
+        if "position" in self.branches:  # Eqs. 3 and 4, whose velocities are those of the lower body
+            lower = position.unflatten(-1, (N_JOINTS, 3))[:, :, list(LOWER)]
+            terms |= {"position_branch": l1(position), "velocity_lower_body": l1(lower.diff(dim=1))}
         if self.hand.branch in self.branches:
             terms |= self.hand(motion, truth, sparse, normalizer)
         return terms
