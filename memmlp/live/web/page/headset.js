@@ -12,8 +12,7 @@ export function trackersOf(frame, space, sources) {
   return [tracker(frame.getViewerPose(space)), hand('left'), hand('right')];
 }
 
-// "hands" or "controllers" for left and right, whose offsets differ; null for neither. A headset may track one hand beside
-// the other's controller.
+// "hands" or "controllers" for left and right, whose offsets differ, also on one headset; null for neither.
 export const kindsOf = sources => ['left', 'right'].map(side => {
   const source = sourceOf(side, sources);
   return source && (source.hand ? 'hands' : 'controllers');
@@ -22,7 +21,7 @@ export const kindsOf = sources => ['left', 'right'].map(side => {
 const sourceOf = (side, sources) =>
   [...sources].find(({ handedness, gripSpace, hand }) => handedness === side && (gripSpace || hand)) ?? null;
 
-// A device that loses a hand guesses its pose for a while, which is used; then it gives no pose.
+// null without a pose; a pose that the device only guesses is used.
 function tracker(pose) {
   if (!pose) return null;
   const { position: p, orientation: q } = pose.transform;

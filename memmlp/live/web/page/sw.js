@@ -6,8 +6,7 @@ const CACHE = `${NAME} ${VERSION}`;
 addEventListener('install', event => event.waitUntil(keep()));
 addEventListener('activate', event => event.waitUntil(takeOver()));
 addEventListener('fetch', event => {
-  const { request } = event;
-  if (request.method === 'GET' && request.url.startsWith(registration.scope)) event.respondWith(answer(request));
+  if (event.request.method === 'GET' && event.request.url.startsWith(registration.scope)) event.respondWith(answer(event.request));
 });
 
 async function keep() {

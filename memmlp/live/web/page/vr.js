@@ -28,8 +28,7 @@ class VrPage {
   constructor(page, site) {
     Object.assign(this, { site, network: site.networks[0], user: null });
     this.canvas = h('canvas', { 'aria-label': 'The view in the mirror' });
-    this.problem = h('p', { class: 'trouble' }, 'Loading the network.');
-    this.support = h('p', { class: 'faint', id: 'support' });
+    this.support = h('p', { class: 'faint', id: 'support' }, 'Loading the network.');
     this.remark = h('p', { class: 'warning', id: 'remark' });
     this.height = h('input', { type: 'number', id: 'height', min: 100, max: 230, step: 'any', placeholder: 'by headset' });
     this.buttons = Object.entries(MODES).map(([mode, name]) =>
@@ -43,7 +42,7 @@ class VrPage {
     try {
       this.mirror = new MirrorScene(this.canvas, site);
     } catch (error) {
-      this.problem.textContent = `This browser does not support WebGL: ${error.message}`;
+      this.support.textContent = `This browser does not support WebGL: ${error.message}`;
       return;
     }
     this.load();
@@ -61,7 +60,7 @@ class VrPage {
         }),
         h('label', { class: 'field' }, h('span', {}, 'Your height [cm]'), this.height)),
       this.remark, this.support,
-      this.view = h('div', { class: 'replay' }, h('div', { class: 'view' }, h('div', { class: 'view-stage' }, this.canvas, this.problem)), this.facts.element),
+      this.view = h('div', { class: 'replay', hidden: true }, h('div', { class: 'view' }, h('div', { class: 'view-stage' }, this.canvas)), this.facts.element),
       h('ol', { class: 'steps' },
         h('li', {}, 'Put on the headset, open this page in its browser, and choose Enter VR (or AR, to see your room).'),
         h('li', {}, 'Pull a trigger, or pinch, and stand in T-pose within three seconds: upright, arms to the sides, palms down, eyes forward.'),
@@ -74,7 +73,7 @@ class VrPage {
     this.remark.hidden = !network.remark;
     this.remark.textContent = `This network is ${network.remark}.`;
     for (const button of this.buttons) button.disabled = true;
-    const failed = error => { this.problem.textContent = `The network did not load: ${error.message}`; };
+    const failed = error => { this.support.textContent = `The network did not load: ${error.message}`; };
     const opened = await openNetwork(network.play).catch(failed);
     const possible = await canEnter();
     if (!opened || network !== this.network) return;
@@ -84,8 +83,6 @@ class VrPage {
     this.support.textContent = !window.isSecureContext ? 'This address is not secure: VR needs https or localhost.'
       : !navigator.xr ? 'This browser does not support WebXR. Open this page in a headset’s browser.'
       : possible.some(Boolean) ? '' : 'There is no headset. Open this page in a headset’s browser.';
-    this.problem.hidden = true;
-    this.view.hidden = this.user === null;
     document.documentElement.dataset.vr = 'ready';
   }
 

@@ -51,10 +51,9 @@ export function word(value) {
 
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return DASH;
-  if (seconds < 90) return `${Math.round(seconds)} s`;
-  if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
-  if (seconds < 129600) return `${(seconds / 3600).toFixed(1)} h`;
-  return `${Math.round(seconds / 86400)} d`;
+  const units = [[90, 's', 1, 0], [5400, 'min', 60, 0], [129600, 'h', 3600, 1], [Infinity, 'd', 86400, 0]]; // [below, unit, its seconds, digits]
+  const [, unit, size, digits] = units.find(([limit]) => seconds < limit);
+  return `${(seconds / size).toFixed(digits)} ${unit}`;
 }
 
 export function ago(text) {
@@ -67,12 +66,8 @@ export function date(text) {
   return Number.isNaN(time.getTime()) ? DASH : time.toLocaleString(undefined, { dateStyle: 'medium', timeStyle: 'short' });
 }
 
-export function bytes(count) {
-  const units = ['B', 'kB', 'MB', 'GB'];
-  let size = count;
-  while (size >= 1000 && units.length > 1) { size /= 1000; units.shift(); }
-  return `${size >= 100 || units[0] === 'B' ? Math.round(size) : size.toFixed(1)} ${units[0]}`;
-}
+// Bytes with a unit, such as 23.4 MB.
+export const bytes = count => window.d3.format('.3~s')(count).replace(/[a-zA-Z]?$/, unit => ` ${unit}B`);
 
 const known = name => about.units[name.split('.').at(-1)] ?? { unit: '', better: '' };
 
