@@ -71,7 +71,7 @@ def fake_run(
     about = {"settings": {}, "made_by": manifest, "made": "2026"} | (evaluated or {})
     words = json.dumps(about)[1:]
     for mode, errors in _errors(run.id, seed, factor, of_clips, tuple(branches)).items():
-        run.evaluation(f"{mode}-0").write_text(f"{errors[:-1]}, {words}")
+        write_evaluation(run.evaluation(f"{mode}-0"), json.loads(f"{errors[:-1]}, {words}"))
     if log:
         run.metrics_path.write_text(_log(run.id, factor))
     return run
@@ -120,6 +120,17 @@ def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequen
         return None if run is None or run.done else run.status
 
     return make_table(sweep, runs_of(sweep, find), modes, command, state)
+
+
+def digest_json(content: Mapping[str, Any]) -> str:
+    """The digest of an evaluation file, computed apart from the project's code."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def write_evaluation(path: Path, report: Mapping[str, Any]) -> None:
+    """Write an evaluation file with a new digest."""
+    content = {key: value for key, value in report.items() if key != "digest"}
+    path.write_text(json.dumps(content | {"digest": digest_json(content)}))
 
 
 def nothing(variant: Variant, seed: int) -> None:

@@ -50,7 +50,7 @@ def evaluate(
         raise InputError(f"--save-predictions {save_predictions}: must be a folder, not a file")
     from rich.console import Console
 
-    from memmlp.cli.train_summary import list_run_warnings, make_metrics_table, make_source_tables
+    from memmlp.cli.train_summary import list_run_warnings, make_all_metrics_tables
     from memmlp.common.files import write_json
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
@@ -65,7 +65,7 @@ def evaluate(
     facts = [opened.run.manifest.get(fact) for fact in ("resampled", "unusual")]
     for line in (*filter(None, facts), *list_run_warnings(opened.run)):
         click.echo(line)
-    for table in (make_metrics_table(results), *make_source_tables(opened.run, experiment.stage_ids)):
+    for table in make_all_metrics_tables(opened.run, results, experiment.stage_ids):
         Console(highlight=False).print(table)
     if json_path is not None:
         write_json(json_path, {"mean": results, "clips": read_clip_rows(experiment, opened.run)})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -18,8 +19,10 @@ from memmlp.report.tables.measured_run import (
     SAME_ERROR_TOLERANCE,
     SHARED_METRIC,
     Errors,
+    MeasuredRun,
     load_measured_run,
 )
+from memmlp.report.tables.table_text import describe_missing_clips
 from memmlp.runs.deployment_folder import (
     INT8_PRECISIONS,
     MAX_GROWTH,
@@ -41,7 +44,7 @@ def show(outcome: Outcome) -> None:
     """Print a run's metrics in both modes, its latency and sizes if measured, and its folder."""
     run, results = outcome.run, outcome.results
     lines: list[Any] = [describe_stages(outcome), *map(format_warning, list_run_warnings(run))]
-    lines += [make_metrics_table(results), *make_source_tables(run, outcome.stage_ids)]
+    lines += make_all_metrics_tables(run, results, outcome.stage_ids)
     if "latency" in results:
         lines += describe_latency(results["latency"])
     lines.append(f"run      {run.folder}")
@@ -147,33 +150,50 @@ def describe_stages(outcome: Outcome) -> str:
     return f"run {outcome.run.id}: {', '.join(outcome.new_stages)} done{ending}"
 
 
-def make_source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:
-    """Yield a table of the metrics on each source's test clips, if the run's data has several sources.
+def make_all_metrics_tables(run: Run, results: Errors, stages: Sequence[str]) -> Iterator[Table]:
+    """Yield a table of the metrics on all test clips, and one for each source if there are several.
 
     Args:
         run: the run.
+        results: the means by mode, branch and metric.
         stages: the identities of the evaluations to show.
     """
-    for source, measured in load_measured_run(run.folder, stages).split_by_source().items():
-        yield make_metrics_table(measured.means, f"test clips of {source} ({len(measured.clips)})")
+    measured = load_measured_run(run.folder, stages)
+    yield make_metrics_table(replace(measured, means=results))
+    for source, part in measured.split_by_source().items():
+        yield make_metrics_table(part, f"test clips of {source} ({len(part.clips)})")
 
 
-def make_metrics_table(results: Errors, title: str = "test clips") -> Table:
-    """Make a table of the metrics on test clips, with a column for each mode and branch."""
-    columns = [(mode, branch) for mode, branch in MODES_AND_BRANCHES if branch in results.get(mode, {})]
+def make_metrics_table(measured: MeasuredRun, title: str = "test clips") -> Table:
+    """Make a table of the metrics on test clips, with a column for each mode and branch.
+
+    A mean over a part of the clips is marked.
+    """
+    means = measured.means
+    columns = [(mode, branch) for mode, branch in MODES_AND_BRANCHES if branch in means.get(mode, {})]
     headers = [f"{mode}\n{branch}" for mode, branch in columns]
-    errors = [results[mode][branch] for mode, branch in columns]
-    return _make_error_table(title, headers, errors, padding=(0, 1, 0, 0))
+    errors = [means[mode][branch] for mode, branch in columns]
+    parts = [
+        {metric: describe_missing_clips(*measured.count_clips(*column, metric)) for metric in own}
+        for column, own in zip(columns, errors, strict=True)
+    ]
+    return _make_error_table(title, headers, errors, parts, padding=(0, 1, 0, 0))
 
 
 def _make_error_table(
-    title: str, headers: Sequence[str], errors: Sequence[Mapping[str, Any]], **style: Any
+    title: str,
+    headers: Sequence[str],
+    errors: Sequence[Mapping[str, Any]],
+    notes: Sequence[Mapping[str, str]] | None = None,
+    **style: Any,
 ) -> Table:
     columns = [Column("metric"), Column("unit"), *(Column(header, justify="right") for header in headers)]
     table = Table(*columns, title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, **style)
     for metric, unit in UNITS.items():
         values = [column.get(metric) for column in errors]
         if any(value is not None for value in values):  # not every column has custom metrics
-            numbers = ("-" if value is None else f"{float(value):.2f}" for value in values)
+            added = [column.get(metric, "") for column in notes or [{}] * len(errors)]
+            pairs = zip(values, added, strict=True)
+            numbers = ("-" if value is None else f"{float(value):.2f}{note}" for value, note in pairs)
             table.add_row(metric, unit, *numbers)
     return table

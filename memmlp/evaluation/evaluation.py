@@ -54,7 +54,8 @@ class Evaluation:
             rows.append({**facts, "frames": len(clips[index]), **errors})
         branches = [{key: row[key] for key in errors} for row in rows]
         label = {} if model.is_stream else {"offline": True}
-        return {"mean": modes.average_clips(branches), "clips": rows, **label}
+        mean = modes.average_clips(branches, [row["frames"] for row in rows])
+        return {"mean": mean, "clips": rows, **label}
 
 
 def predict_first_clip(model: MotionModel, test: MotionDataset) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,9 @@ UNITS = {
     "Root PE": "cm", "MPJVE": "cm/s", "Jitter": "10^2 m/s^3", "GT Jitter": "10^2 m/s^3",
 }  # fmt: skip
 
+MIN_FRAMES = {"MPJVE": 2, "Jitter": 4, "GT Jitter": 4}
+"""The number of frames that a metric needs; 1 for all others. Shorter clips have no value, which is NaN."""
+
 HIGHER: set[str] = set()
 """Names of the custom metrics for which higher values are better."""
 

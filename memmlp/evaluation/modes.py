@@ -29,6 +29,7 @@ from torch import Tensor
 from memmlp.common.progress import progress_bar
 from memmlp.evaluation import metrics
 from memmlp.evaluation.ik import IK, NoIK
+from memmlp.evaluation.metric_facts import MIN_FRAMES
 from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.geometry import sixd_to_matrix
@@ -153,11 +154,21 @@ def measure_rotation_branch(
     head on its tracker.
     """
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
+    motion = mark_invalid_rotations(motion)
     rotations = extract_rotations(motion), extract_rotations(target)
     positions = normalizer.compute_positions(motion, sparse), extract_positions(target)
     report = metrics.measure_rotations(*rotations) | metrics.measure_positions(*positions)
     report |= metrics.compute_custom_metrics(custom or {}, "rotations", *rotations)
     return report | metrics.compute_custom_metrics(custom or {}, "positions", *positions)
+
+
+def mark_invalid_rotations(motion: Tensor) -> Tensor:
+    """Return motion (N, 198) with NaN for 6D rotations whose columns are zero or parallel."""
+    columns = extract_rotations(motion).norm(dim=-2)  # Gram-Schmidt leaves zero columns short
+    valid = (columns > 0.5).all(-1).repeat_interleave(6, dim=-1)
+    marked = motion.clone()
+    marked[:, ROTATION] = torch.where(valid, motion[:, ROTATION], math.nan)
+    return marked
 
 
 def extract_rotations(motion: Tensor) -> Tensor:
@@ -183,11 +194,15 @@ def cut_clips(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
 def measure_stream(
     network: MotionModel, pieces: Sequence[Tensor], custom: metrics.UserMetrics | None = None
 ) -> dict[str, float]:
-    """Return the stream-mode metrics, averaged over pieces of clips. Validation during training uses them."""
+    """Return the stream-mode metrics, averaged over pieces of clips. Validation during training uses them.
+
+    A mean over only a part of the pieces is NaN.
+    """
     motions = predict_stream(network, pieces)
     pairs = zip(motions, pieces, strict=True)
     mean = average_clips(
-        [measure_clip(network.normalizer, motion, piece, custom=custom) for motion, piece in pairs]
+        [measure_clip(network.normalizer, motion, piece, custom=custom) for motion, piece in pairs],
+        [max(map(len, pieces))] * len(pieces),
     )
     return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
 
@@ -203,18 +218,26 @@ def _sort_and_pad(clips: Sequence[Tensor]) -> tuple[list[int], list[int], Tensor
     return order, [len(clips[i]) for i in order], inputs
 
 
-def average_clips(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+def average_clips(
+    rows: Sequence[dict[str, dict[str, float]]], frames: Sequence[int]
+) -> dict[str, dict[str, float]]:
     """Return the mean metrics of each branch over clips; clips that are too short for a metric are skipped.
 
-    If the network returned NaN for a clip, all means of the branch are NaN.
+    A mean is NaN if any other clip has no value. If the network returned NaN for a clip, all means of the
+    branch are NaN.
+
+    Args:
+        rows: the metrics of each clip by branch.
+        frames: the number of frames of each clip.
     """
     return {
-        branch: {name: _average_metric([row[branch] for row in rows], name) for name in values}
+        branch: {name: _average_metric([row[branch] for row in rows], frames, name) for name in values}
         for branch, values in rows[0].items()
     }
 
 
-def _average_metric(rows: Sequence[dict[str, float]], name: str) -> float:
+def _average_metric(rows: Sequence[dict[str, float]], frames: Sequence[int], name: str) -> float:
     if any(math.isnan(row["MPJPE"]) for row in rows):  # MPJPE is defined even for the shortest clip
         return math.nan
-    return float(torch.tensor([row[name] for row in rows]).nanmean())
+    long = [row[name] for row, number in zip(rows, frames, strict=True) if number >= MIN_FRAMES.get(name, 1)]
+    return float(torch.tensor(long).mean()) if long else math.nan

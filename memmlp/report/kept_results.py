@@ -187,8 +187,8 @@ def load_kept_results(path: Path) -> KeptResults:
     """Read a results file. Raises InputError if it is damaged, or was edited by hand."""
     try:
         content = json.loads(path.read_bytes())
-        if content.pop("digest") != _digest(content):
-            raise ValueError("edited by hand")
+        if content.pop("digest", None) != _digest(content):
+            raise ValueError("edited by hand: its digest is missing or wrong")
         runs = {
             name: _parse_record(name, record, content["clips"][record["clips"]])
             for name, record in content["runs"].items()

@@ -28,6 +28,7 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
     """Write an evaluation file: the report with time, environment and a digest."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = make_json_safe({**report, "made": now(), "made_by": describe_environment()})
+    content.pop("digest", None)
     write_json(path, content | {"digest": _compute_content_digest(content)})
 
 

@@ -262,7 +262,7 @@ def test_values_of_two_inverse_kinematics_are_named_and_not_subtracted(memmlp: M
         run, settings = Run.from_id(outputs, name), {"mode": "stream", "ik": ik}
         report = {"mode": "stream", "settings": settings, "mean": {"combined": {"MPJPE": value}}, "clips": []}
         run.evaluations.mkdir(exist_ok=True)
-        write_json(run.evaluation(hash_evaluation_settings(settings)), report)
+        write_report(run.evaluation(hash_evaluation_settings(settings)), report)
     said = memmlp("runs", "diff", A, B).out
     rows = {line.split()[0]: line.split() for line in said.splitlines() if "combined" in line}
     assert rows["stream.combined-arms.MPJPE"][1:4] == ["2.5", "-", "-"]

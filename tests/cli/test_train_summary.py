@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 from fake_runs import fake_run
 
-from memmlp.cli.train_summary import describe_latency, make_source_tables, show, show_side_by_side
+from memmlp.cli.train_summary import describe_latency, make_all_metrics_tables, show, show_side_by_side
 from memmlp.runs.evaluation_file import write_report
 from memmlp.training.request import Outcome
 
@@ -29,7 +29,8 @@ def test_tables_of_sources_are_of_the_evaluation_that_is_shown(tmp_path: Path):
     write_report(run.evaluation("stream-1"), report)
 
     def first(stage: str) -> list[float]:
-        return [float(next(iter(table.columns[2].cells))) for table in make_source_tables(run, [stage])]
+        _, *tables = make_all_metrics_tables(run, {}, [stage])
+        return [float(next(iter(table.columns[2].cells))) for table in tables]
 
     assert len(first("stream-0")) == 2
     for once, thrice in zip(first("stream-0"), first("stream-1"), strict=True):

@@ -9,7 +9,8 @@ import torch
 
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
-from memmlp.evaluation.modes import measure_stream
+from memmlp.evaluation.modes import average_clips, measure_clip, measure_stream
+from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
 
 STREAM = Evaluation(("stream",), batch=4, ik=NoIK(), seed=0)
@@ -19,6 +20,31 @@ TEST = tiny.frames((14, 11))
 RECURRENT = {
     name: partial(tiny.recurrent_poser, Heading(), output=name) for name in ["local", "global", "reaching"]
 }
+
+
+def test_a_rotation_of_zeros_or_parallel_columns_is_no_rotation():
+    motion, truth = tiny.clip(8)[:, SPARSE_DIM:].clone(), tiny.clip(8)
+    sound = measure_clip(tiny.normalizer(Heading()), motion, truth)
+    assert sound["rotation"]["MPJRE"] == pytest.approx(0, abs=1e-2)
+    for columns in ([0.0] * 6, [1.0, 0.0, 0.0, 2.0, 0.0, 0.0]):
+        broken = motion.clone()
+        broken[3, 12:18] = torch.tensor(columns)
+        found = measure_clip(tiny.normalizer(Heading()), broken, truth)
+        assert math.isnan(found["rotation"]["MPJRE"])
+        assert math.isnan(found["rotation"]["MPJPE"])
+        assert found["position"] == sound["position"]
+
+
+def test_a_mean_over_a_part_of_the_clips_is_no_number_unless_the_others_are_too_short():
+    rows = [
+        {"rotation": {"MPJPE": 1.0, "Jitter": jitter, "own": own}}
+        for jitter, own in ((2.0, 3.0), (math.nan, 5.0))
+    ]
+    short = average_clips(rows, [600, 3])["rotation"]
+    assert short == {"MPJPE": 1, "Jitter": 2, "own": 4}
+    assert math.isnan(average_clips(rows, [600, 4])["rotation"]["Jitter"])
+    rows[1]["rotation"]["own"] = math.nan
+    assert math.isnan(average_clips(rows, [600, 3])["rotation"]["own"])
 
 
 def test_a_network_that_diverged_is_evaluated_like_any_other():
@@ -33,10 +59,11 @@ def test_a_network_that_diverged_is_evaluated_like_any_other():
 
 @pytest.mark.parametrize("broken", [False, True])
 def test_a_clip_without_numbers_is_no_clip_less(broken: bool):
-    """One that is too short for a metric is; but a network that diverges on a clip has no mean."""
+    """A validation has no mean over a part of its pieces, here of one that is too short for Jitter."""
     network, clips = tiny.model(), [tiny.clip(40, seed=1), tiny.clip(2, seed=2)]
     if broken:
         clips[0][20] = math.nan
     found = measure_stream(network, clips)
     assert math.isnan(found["rotation MPJPE"]) == broken
-    assert math.isnan(found["rotation Jitter"]) == broken
+    assert math.isnan(found["rotation MPJVE"]) == broken
+    assert math.isnan(found["rotation Jitter"])

@@ -138,8 +138,13 @@ def _make_row(
         numbers = {seed: run.get_value(mode, variant.branch, metric) for seed, run in counted.items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}
         effect = effects.get(Key(variant.label, mode, metric))
+        clips = [run.count_clips(mode, variant.branch, metric) for run in counted.values()]
         return Cell(
-            values, (variant.paper or {}).get(metric), effect, find_paper_effect(sweep, variant, metric)
+            values,
+            (variant.paper or {}).get(metric),
+            effect,
+            find_paper_effect(sweep, variant, metric),
+            *(min(clips, default=(0, 0)) if values and metric not in COSTS else ()),
         )
 
     control = find_control(sweep, variant)

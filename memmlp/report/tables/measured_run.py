@@ -15,6 +15,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.common.processes import MIN_CORE_FRACTION
+from memmlp.evaluation.metric_facts import MIN_FRAMES
 from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import (
     describe_timing_machine,
@@ -152,6 +153,11 @@ class MeasuredRun:
             found = [clips[name].get(mode, {}).get(branch, {}).get(metric) for name in names]
         return np.array(found, float)  # None becomes NaN
 
+    def count_clips(self, mode: str, branch: str, metric: str) -> tuple[int, int]:
+        """Return the number of clips with a value for a metric, and the number of all clips."""
+        known = np.isfinite(self.get_clip_values(list(self.clips), mode, branch, metric))
+        return int(known.sum()), len(known)
+
     def get_group(self, clip: str) -> str:
         """Return a clip's group; an unlisted clip forms a separate group."""
         return self.groups.get(clip, clip)
@@ -217,11 +223,12 @@ class MeasuredRun:
 def _average_clips(values: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Return the mean of each metric over clips (C,), like the evaluation (`modes.evaluate`).
 
-    A mean excludes clips that are too short for the metric. If the network diverged on a clip, all means are
-    NaN. SHARED_METRIC shows this, because it has a number even for the shortest clip.
+    A mean excludes clips that are too short for the metric (MIN_FRAMES). Other missing values make it NaN.
+    If the network diverged on a clip, all means are NaN. SHARED_METRIC shows this, because it has a number
+    even for the shortest clip.
     """
     diverged = SHARED_METRIC in values and bool(np.isnan(values[SHARED_METRIC]).any())
-    known = {metric: each[~np.isnan(each)] for metric, each in values.items()}
+    known = {m: each[~np.isnan(each)] if m in MIN_FRAMES else each for m, each in values.items()}
     return {m: float(each.mean()) if len(each) and not diverged else math.nan for m, each in known.items()}
 
 
@@ -244,7 +251,7 @@ def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> Meas
     sources: dict[str, str] = {}
     wanted = [path for name in stages or () if (path := run.evaluation(name)).is_file()]
     paths = wanted or run.configured_evaluations.paths
-    reports = keep_one_solver(list(map(_read_intact_json, paths)))
+    reports = keep_one_solver(list(map(_read_evaluation, paths)))
     for report in reports:
         _merge_report(means.setdefault(report["mode"], {}), report["mean"])
         for clip in report["clips"]:
@@ -292,8 +299,18 @@ def _merge_report(merged: dict[str, Any], report: Mapping[str, Any]) -> None:
 
 def _read_intact_json(path: Path) -> dict[str, Any]:
     content = read_json(path)
-    if not content or ("digest" in content and not is_intact(path)):
+    if not content:
         raise InputError(f"{path}: cannot be read; repeat the run with force=true, or remove its folder")
+    return content
+
+
+def _read_evaluation(path: Path) -> dict[str, Any]:
+    content = _read_intact_json(path)
+    if not is_intact(path):
+        raise InputError(
+            f"{path}: changed since it was written (its digest is missing or wrong); "
+            "remove it and repeat the run's command to evaluate again"
+        )
     return content
 
 

@@ -73,12 +73,22 @@ class Effect:
 
 @dataclass(frozen=True)
 class Cell:
-    """A variant's metric: values by seed, the paper's value, and measured and printed effect."""
+    """A variant's metric: values by seed, the paper's value, and measured and printed effect.
+
+    Attributes:
+        values: the means over clips by seed.
+        paper: the paper's value; None without one.
+        effect: the measured difference from the control.
+        paper_effect: the paper's difference from the control.
+        counted, clips: the number of clips with a value, the smallest over seeds, and of all clips.
+    """
 
     values: Mapping[int, float]
     paper: float | None = None
     effect: Effect | None = None
     paper_effect: float | None = None
+    counted: int = 0
+    clips: int = 0
 
     @property
     def mean(self) -> float | None:

@@ -262,7 +262,12 @@ def format_value(cell: Cell, metric: str) -> str:
         return format_significant(cell.mean, 3)
     digits = count_decimals(cell.mean)
     sd = "" if cell.sd is None else f" ± {cell.sd:.{digits}f}"
-    return f"{cell.mean:.{digits}f}{sd}"
+    return f"{cell.mean:.{digits}f}{sd}{describe_missing_clips(cell.counted, cell.clips)}"
+
+
+def describe_missing_clips(counted: int, clips: int) -> str:
+    """Return ` (9 of 12 clips)` if a mean is over a part of the clips, otherwise an empty text."""
+    return f" ({counted} of {clips} clips)" if counted < clips else ""
 
 
 def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of
+from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of, write_evaluation
 from fake_table import EFFECTS, cell, printed
 
 from memmlp.report.tables.build_table import make_table
@@ -248,7 +248,7 @@ def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(
             report["clips"][0][branch]["Jitter"] = "nan"  # of every run: it is too short
         if (one, seed) == (variant, 1):
             report["clips"][1]["rotation"] |= dict.fromkeys(("MPJPE", "MPJRE"), word)
-        path.write_text(json.dumps(report))
+        write_evaluation(path, report)
     table, lost = table_of(sweep, find), ("MPJPE", "MPJRE")
     assert all(cell(before, "no | memory", metric).effect.is_significant for metric in (*lost, "Jitter"))
     for metric in lost:

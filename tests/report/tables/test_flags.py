@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, nothing, runs_of, table_of
+from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, nothing, runs_of, table_of, write_evaluation
 from fake_table import cell, printed
 
 from memmlp.report.kept_results import KeptResults, format_results, load_kept_results
@@ -45,9 +45,11 @@ def flags(sweep: Sweep, tmp_path: Path) -> Callable[..., list[str]]:
 def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Change the content of a JSON file."""
     content = json.loads(path.read_text())
-    content.pop("digest", None)
     change(content)
-    path.write_text(json.dumps(content))
+    if "digest" in content:
+        write_evaluation(path, content)
+    else:
+        path.write_text(json.dumps(content))
 
 
 def runs_in(sweep: Sweep, find: Callable[..., Run | None]) -> dict[tuple[str, int], Run]:

@@ -9,12 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, table_of
+from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, table_of, write_evaluation
+from fake_table import cell
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.kept_results import KeptResults, format_results, load_kept_results
 from memmlp.report.tables.measured_run import MeasuredRun, load_measured_run
+from memmlp.report.tables.table_text import format_value
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import VERSIONS, hash_deployment_settings, list_outdated
 from memmlp.sweep.definition import Sweep
@@ -80,6 +82,32 @@ def test_a_refined_network_saw_its_own_frames_and_the_refiners(tmp_path: Path):
     assert seen == [140, 140 + 600]
     orphan = fake_run(tmp_path, "orphan", config=config, origin={"prerequisite": "0" * 16})
     assert "frames" not in load_measured_run(orphan.folder).training  # what came before is not known
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_results_without_their_digest_are_refused(tmp_path: Path, keep: bool):
+    run = fake_run(tmp_path, "a")
+    path = run.evaluation("stream-0")
+    report = json.loads(path.read_text())
+    report["mean"]["rotation"]["MPJPE"] = 1.0
+    path.write_text(json.dumps({key: value for key, value in report.items() if keep or key != "digest"}))
+    with pytest.raises(InputError, match=r"stream-0.json: changed .* digest"):
+        load_measured_run(run.folder)
+
+
+def test_clips_without_a_value_are_counted_at_the_number(tmp_path: Path, sweep: Sweep):
+    find = fake_sweep(tmp_path, sweep)
+    run = find(sweep.variants[3], 1)
+    assert run is not None
+    path = run.evaluation("stream-0")
+    report = json.loads(path.read_text())
+    for clip in report["clips"][:2]:
+        clip["rotation"]["Jitter"] = "NaN"
+    write_evaluation(path, report)
+    table = table_of(sweep, find)
+    found = [cell(table, "full_model", metric) for metric in ("Jitter", "MPJPE")]
+    assert [(one.counted, one.clips) for one in found] == [(10, 12), (12, 12)]
+    assert [format_value(one, "Jitter").endswith("(10 of 12 clips)") for one in found] == [True, False]
 
 
 def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from chromium import Browser
+from fake_runs import write_evaluation
 from report.ui.conftest import SEEDS, make_outputs, predict, run_of, started_run
 
 from memmlp.cli.sweep import analyse
@@ -141,7 +142,7 @@ def scored(run: Run, **values: float) -> None:
         report = json.loads(path.read_text())
         for errors in (report["mean"], *report["clips"]):
             errors["rotation"] |= values
-        path.write_text(json.dumps(report))
+        write_evaluation(path, report)
 
 
 def test_units_and_directions_of_custom_metrics(

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_runs import fake_run
+from fake_runs import fake_run, write_evaluation
 from report.ui.conftest import predict, run_of
 
 from memmlp.cli.sweep import analyse
@@ -131,7 +131,7 @@ def test_variants_of_one_training_have_each_the_value_of_their_own_evaluation(ou
     own = report["mean"]["rotation"]["MPJPE"]
     report["mean"]["rotation"]["MPJPE"] += 7.0
     report["settings"] = {"memory.blend": 0.25}  # is no evaluation of the run's own config
-    run.evaluation("stream-1").write_text(json.dumps(report))
+    write_evaluation(run.evaluation("stream-1"), report)
     path = outputs / "sweeps" / "mine" / "plan.json"
     plan = json.loads(path.read_text())
     for planned in (*plan["entries"], *plan["tasks"]):

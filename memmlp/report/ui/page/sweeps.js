@@ -152,10 +152,10 @@ function otherBranches(row, mode, metric) {
   return lines.map(([branch, effect]) => h('small', { class: 'faint branch' }, `${branch} ${signed(effect.mean, digits(effect))}${effect.verdict ? ` ${effect.verdict}` : ''}`));
 }
 
-function cell({ mean, sd, effect, paper, paper_effect: paperEffect }, metric) {
+function cell({ mean, sd, effect, paper, paper_effect: paperEffect, counted, clips }, metric) {
   const digits = effectDigits({ ...effect, value: mean });
   return [
-    h('span', { class: 'strong' }, mean === null ? DASH : metricNumber(metric, mean), sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(sd, mean >= 1000 ? 0 : decimals(mean))}`)),
+    h('span', { class: 'strong' }, mean === null ? DASH : metricNumber(metric, mean), sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(sd, mean >= 1000 ? 0 : decimals(mean))}`), counted < clips ? h('small', { class: 'faint' }, ` (${counted} of ${clips} clips)`) : null),
     effect && h('span', { class: significant(effect) ? 'strong' : '' }, signed(effect.mean, digits), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`)),
     effect?.verdict && [h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null,
       bothP(effect) ? h('small', { class: 'faint' }, ` ${bothP(effect)}`) : null],
