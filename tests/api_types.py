@@ -3,8 +3,6 @@
 Each wrong line below has an error that mypy must find: an unused `type: ignore` is an error itself.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import assert_type
 

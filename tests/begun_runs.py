@@ -1,7 +1,5 @@
 """Run folders without a training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from memmlp.runs.evaluation_file import write_report

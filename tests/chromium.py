@@ -131,14 +131,12 @@ class Browser:
         return self.chromium.call(method, self.session, self.errors, parameters)
 
     def value(self, expression: str, **options: Any) -> Any:
-        """The value of an expression on the page."""
         given = {"expression": expression, "returnByValue": True, "userGesture": True, **options}
         result = self.call("Runtime.evaluate", **given)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
     def resolved(self, expression: str) -> Any:
-        """The value of a promise on the page."""
         late = f"setTimeout(() => fail(new Error('not within {PATIENCE:.0f} s')), {1000 * PATIENCE:.0f})"
         return self.value(
             f"Promise.race([{expression}, new Promise((_, fail) => {late})])", awaitPromise=True
@@ -153,7 +151,6 @@ class Browser:
         return until(lambda: self.value(expression), f"{expression}; {self.errors}", self.process)
 
     def open(self, url: str) -> None:
-        """Go to a page."""
         self.call("Page.navigate", url=url)
         self.wait(f"location.href.startsWith({url!r}) && document.readyState == 'complete'")
 

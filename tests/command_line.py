@@ -1,7 +1,5 @@
 """`memmlp` as a person types it, on runs of a few steps."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os
@@ -66,7 +64,6 @@ def _draw_one_pixel(model: Any, split: Any, path: Path) -> None:
 
 
 def in_folder(folder: Path, *arguments: str) -> None:
-    """Run a command line in that folder; for `processes.forked`."""
     os.chdir(folder)
     sys.exit(exit_code(arguments))
 

@@ -1,12 +1,8 @@
 """Random differences with means of known variance."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from memmlp.report.tables.statistics import (
-    correct_by_holm,
-)
+from memmlp.report.tables.statistics import correct_by_holm
 
 TABLE = 24  # comparisons of a table
 SHARES = {  # of seeds, clips' groups, clips, exponential clips and noise in the mean's variance

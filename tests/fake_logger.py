@@ -35,20 +35,16 @@ class Server:
 
 
 class FakeLogger:
-    """A logger in memory."""
-
     place = "memory"
 
     def __init__(self, server: Server | None = None, name: str = "fake"):
         self.server, self.name = server or Server(), name
 
     def fingerprint(self, run_id: str) -> str | None:
-        """The fingerprint of the run's last state."""
         self.server.ask()
         return self.server.fingerprints.get(run_id)
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> FakeShown:
-        """Replace the content of the run."""
         self.server.ask()
         self.server.begun += 1
         self.server.status[facts.id] = facts.status
@@ -60,13 +56,10 @@ class FakeLogger:
 
 
 class FakeShown:
-    """A run in memory."""
-
     def __init__(self, server: Server, run_id: str):
         self.server, self.run_id = server, run_id
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Append values."""
         self.server.ask()
         self.server.values[self.run_id] += [(p.key, p.step, p.value) for p in points]
         if self.server.drops:
@@ -84,7 +77,6 @@ class FakeShown:
 
 
 def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object) -> Run:
-    """A run that has started, with some steps."""
     run = Run.from_id(outputs, name)
     run.begin("memmlp", {"seed": 0, **config}, data="d" * 64, prerequisite=None, stages=[])
     for step in range(1, steps + 1):
@@ -93,7 +85,6 @@ def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object)
 
 
 def losses(steps: int) -> list[tuple[str, int, float]]:
-    """A logger's values for a run's steps."""
     return [("train/loss", step, 1 / step) for step in range(1, steps + 1)]
 
 

@@ -1,7 +1,5 @@
 """Finished runs of random numbers, for tests of tables and pages."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json
@@ -103,8 +101,6 @@ def fake_sweep(
 def runs_of(
     sweep: Sweep, find: Find, read: Callable[[Path], MeasuredRun] = load_measured_run
 ) -> dict[str, RunsBySeed]:
-    """The finished runs."""
-
     def measured(variant: Variant, seed: int) -> MeasuredRun | None:
         run = find(variant, seed)
         return read(run.folder) if run is not None and run.done else None
@@ -113,8 +109,6 @@ def runs_of(
 
 
 def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequence[str] = MODES) -> Table:
-    """The table of all runs."""
-
     def state(variant: Variant, seed: int) -> str | None:
         run = find(variant, seed)
         return None if run is None or run.done else run.status

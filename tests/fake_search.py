@@ -1,7 +1,5 @@
 """Searches with simulated runs: a trial's error is a function of its values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -55,7 +53,6 @@ def log(run: Run, step: int, value: float) -> None:
 
 
 def finish(plan: Plan) -> None:
-    """Bring the runs of a plan to their end."""
     for task in plan.list_remaining():
         run = plan.get_run(task)
         run.begin("memmlp", task.config, data="d", prerequisite=None)
@@ -70,7 +67,6 @@ def to_the_end(study: Study, folder: Path, capacity: int = 2) -> None:
 
 
 def begun(plan: Plan) -> Run:
-    """Begin the run of a plan's only task, and return it."""
     (task,) = plan.tasks
     run = plan.get_run(task)
     run.begin("memmlp", task.config, data="d", prerequisite=None)

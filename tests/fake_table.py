@@ -1,7 +1,5 @@
 """A sweep and its table of runs with random numbers."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -4,8 +4,6 @@
 did not: raise that first, in its declaration or in memmlp/runs/identity.py, in the same commit.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile
@@ -37,35 +35,18 @@ from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
+from memmlp.networks import predictor
 from memmlp.networks.constant_pose import ConstantPose, ConstantPoseSettings
 from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, MemoryWithoutCodes
-from memmlp.networks.predictor import (
-    RotationOnlyMemorySettings,
-    RotationOnlySettings,
-    TwoBranchMemorySettings,
-    TwoBranchSettings,
-)
 from memmlp.networks.recurrent_poser import CELLS
 from memmlp.networks.streaming import make_streaming_graph
 from memmlp.runs.identity import find_version
+from memmlp.training import losses
 from memmlp.training.compute import measure_step
 from memmlp.training.loop import seed_step
-from memmlp.training.losses import (
-    AGRoLLoss,
-    AvatarPoserLoss,
-    KinematicHandTerm,
-    Loss,
-    LossOfNetwork,
-    ManualWeights,
-    MotionLoss,
-    NoHandTerm,
-    PositionHandTerm,
-    RPMLoss,
-    TermsLoss,
-    UncertaintyWeights,
-)
+from memmlp.training.losses import Loss, MotionLoss, NoHandTerm, TermsLoss
 from memmlp.training.losses.baseline_losses import AGRoLLossSettings, AvatarPoserLossSettings
 from memmlp.training.losses.terms import ERRORS, TERMS
 from memmlp.training.optim import Muon, Optim, ScheduleFree
@@ -189,6 +170,11 @@ def steps_compute() -> Numbers:
     return found | {"muon": measure_step(TASKS["forced"](optim=muon), muon).optimiser}
 
 
+def loss_of_network() -> Numbers:
+    given = (torch.ones(1, 1, size) for size in (198, 198, 54))
+    return {"total": float(losses.LossOfNetwork()(*given, tiny.normalizer())[0])}
+
+
 def mixed() -> Numbers:
     """A loss under autocast, which computes it in float32."""
     with torch.autocast("cpu", torch.bfloat16):
@@ -204,7 +190,7 @@ def weighted(make: Callable[[], Loss]) -> Numbers:
     return found | {f"weight {name}": value for name, value in one.weighting.weights().items()}
 
 
-def hand(term: NoHandTerm | PositionHandTerm | KinematicHandTerm) -> Numbers:
+def hand(term: NoHandTerm | losses.PositionHandTerm | losses.KinematicHandTerm) -> Numbers:
     predicted, true = pair()
     terms = term(
         predicted[..., SPARSE_DIM:], true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.normalizer(World())
@@ -213,7 +199,6 @@ def hand(term: NoHandTerm | PositionHandTerm | KinematicHandTerm) -> Numbers:
 
 
 def measured() -> Numbers:
-    """A clip's report of both branches, and of its rotations alone."""
     predicted, true = tiny.clip(30, 1)[:, SPARSE_DIM:], tiny.clip(30, 5)
     report = evaluation.measure_clip(tiny.normalizer(World()), predicted, true)
     found = {f"{branch} {name}": value for branch, of in report.items() for name, value in of.items()}
@@ -256,7 +241,6 @@ def deployed(graph: str) -> Numbers:
 
 @cache
 def exported(graph: str) -> bytes:
-    """The ONNX file of a graph of the tiny network."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "step.onnx"
         export(GRAPHS[graph](tiny.model()), path, "0" * 16)
@@ -264,7 +248,6 @@ def exported(graph: str) -> bytes:
 
 
 def lowered(precision: str) -> Numbers:
-    """An exported stream in lower precision."""
     with tempfile.TemporaryDirectory() as folder:
         exact, other = (Path(folder) / f"{name}.onnx" for name in ("exact", "other"))
         exact.write_bytes(exported("graph.streaming"))
@@ -279,7 +262,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"coordinates.{name}": partial(coordinates, kind)
         for name, kind in (("heading", Heading), ("head_relative", HeadRelative), ("world", World))
     },
-    "model.mem_mlp": lambda: network(tiny.model(NoMemory, RotationOnlySettings)),
+    "model.mem_mlp": lambda: network(tiny.model(NoMemory, predictor.RotationOnlySettings)),
     **{
         f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
         for name in tiny.BASELINES
@@ -302,8 +285,10 @@ CASES: dict[str, Callable[[], Numbers]] = {
     **{
         f"predictor.{name}": partial(lambda kind: network(tiny.model(MemoryWithoutCodes, kind)), kind)
         for name, kind in {
-            "two_branch": TwoBranchSettings, "two_branch_memory": TwoBranchMemorySettings,
-            "rotation_only": RotationOnlySettings, "rotation_only_memory": RotationOnlyMemorySettings,
+            "two_branch": predictor.TwoBranchSettings,
+            "two_branch_memory": predictor.TwoBranchMemorySettings,
+            "rotation_only": predictor.RotationOnlySettings,
+            "rotation_only_memory": predictor.RotationOnlyMemorySettings,
         }.items()
     },
     "refiner.sage": refiner,
@@ -323,22 +308,26 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "rollout.teacher_forcing": partial(rollout, TeacherForcing),
     "rollout.own_predictions": partial(rollout, partial(OwnPredictions, 2)),
     "rollout.streams": partial(rollout, partial(PersistentStreams, 4)),
-    "loss.uncertainty": partial(weighted, lambda: MotionLoss(UncertaintyWeights(0.01), NoHandTerm(), BOTH)),
-    "loss.manual": partial(weighted, lambda: MotionLoss(ManualWeights(), NoHandTerm(), BOTH)),
+    **{
+        f"loss.{name}": partial(weighted, partial(lambda make: MotionLoss(make(), NoHandTerm(), BOTH), make))
+        for name, make in {
+            "uncertainty": partial(losses.UncertaintyWeights, 0.01), "manual": losses.ManualWeights,
+        }.items()
+    },
     "loss.agrol": lambda: {
         f"{error} {name}": value
         for error in ("norm", "square")
-        for name, value in loss(partial(AGRoLLoss, AGRoLLossSettings(error))).items()
+        for name, value in loss(partial(losses.AGRoLLoss, AGRoLLossSettings(error))).items()
     },
     "loss.avatar_poser": lambda: {
         f"{anchor} {name}": value
         for anchor in ("pelvis", "head")
-        for name, value in loss(partial(AvatarPoserLoss, AvatarPoserLossSettings(anchor=anchor))).items()
+        for name, value in loss(
+            partial(losses.AvatarPoserLoss, AvatarPoserLossSettings(anchor=anchor))
+        ).items()
     },
-    "loss.rpm": lambda: loss(RPMLoss),
-    "loss.of_network": lambda: {
-        "total": float(LossOfNetwork()(*(torch.ones(1, 1, n) for n in (198, 198, 54)), tiny.normalizer())[0])
-    },
+    "loss.rpm": lambda: loss(losses.RPMLoss),
+    "loss.of_network": loss_of_network,
     "loss.terms": lambda: {
         f"{error} {name}": value
         for error in ERRORS
@@ -347,8 +336,8 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "weighting.learned": partial(
         weighted, partial(TermsLoss, weighting="learned", rotation=2.0, velocity=30.0)
     ),
-    "hand.position": lambda: hand(PositionHandTerm()),
-    "hand.fk": lambda: hand(KinematicHandTerm()),
+    "hand.position": lambda: hand(losses.PositionHandTerm()),
+    "hand.fk": lambda: hand(losses.KinematicHandTerm()),
     "hand.off": lambda: hand(NoHandTerm()),
     "metrics": measured,
     "mode.stream": partial(mode, "stream"),
@@ -388,7 +377,6 @@ def numbers(case: str) -> Numbers:
 
 
 def stored() -> dict[str, dict[str, Any]]:
-    """The content of golden.json: version and numbers by component."""
     return json.loads(PATH.read_text()) if PATH.exists() else {}
 
 
@@ -398,11 +386,8 @@ def record() -> None:
     New numbers of an unchanged version are added.
     """
     before, now = stored(), {case: numbers(case) for case in CASES}
-    known = {
-        case: before[case]["numbers"]
-        for case in CASES
-        if before.get(case, {}).get("recipe") == find_version(case)
-    }
+    same = [case for case in CASES if before.get(case, {}).get("recipe") == find_version(case)]
+    known = {case: before[case]["numbers"] for case in same}
     wrong = [case for case, old in known.items() if old.keys() & changed(now[case], old, tolerance(case))]
     if wrong:
         sys.exit(f"raise the version of {', '.join(wrong)}: their numbers changed")

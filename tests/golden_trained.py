@@ -1,7 +1,5 @@
 """Golden numbers of a few training steps: losses, then weights."""
 
-from __future__ import annotations
-
 import tiny
 import torch
 from tiny_tasks import part_task
@@ -46,12 +44,10 @@ def summary(name: str, values: Tensor) -> Numbers:
 
 
 def frames() -> MotionDataset:
-    """Three clips of different lengths."""
     return tiny.frames((60, 45, 80))
 
 
 def vqvae(codebook: str = "ema") -> Numbers:
-    """Three training steps, then validation."""
     torch.manual_seed(3)
     model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
     optim = make_vqvae_optim(3, batch=16, lr=1e-3, weight_decay=0.1)
@@ -111,7 +107,6 @@ def training() -> Numbers:
 
 
 def optimised(kind: type[Optim] = Optim, **changes: float) -> Numbers:
-    """Three steps of the loop with an optimiser."""
     torch.manual_seed(2)
     optim = kind(steps=3, batch=4, lr=1e-2, final_lr=1e-3, weight_decay=0.1, **changes)
     task = MotionTask(Line(), Squares(), TeacherForcing(), frames(), optim, 0, lambda network: {})

@@ -1,7 +1,5 @@
 """Threads that count as machines, which share a folder, but neither clocks nor locks."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random
@@ -20,8 +18,6 @@ from memmlp.common.lease import ChangeTimer
 
 
 class Clock:
-    """A clock that a test sets."""
-
     def __init__(self) -> None:
         self.now = 1000.0
 
@@ -51,13 +47,10 @@ def apart(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 class Machine:
-    """A thread that does one thing after another."""
-
     def __init__(self, name: str):
         self.thread = ThreadPoolExecutor(1, thread_name_prefix=name)
 
     def __call__(self, action: Callable[..., Any], *arguments: Any) -> Any:
-        """Do it there, and return the result."""
         return self.thread.submit(action, *arguments).result()
 
 

@@ -6,8 +6,6 @@ Each mutant is tested in a copy of the checkout, by the test file that mirrors i
 folder's tests. Exits with 1 if a mutant survives: a test is missing, or the change makes no difference.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import functools
@@ -51,7 +49,6 @@ class Mutant(NamedTuple):
 
 
 def replacements(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
-    """Pieces of a node, each with its replacement."""
     match node:
         case ast.Compare(left, [op, *_], [right, *rest]) if not rest:
             yield node, f"{ast.unparse(left)} {OTHER[type(op)]} {ast.unparse(right)}"
@@ -127,7 +124,6 @@ def sound(root: Path, tests: Path, marker: str) -> bool:
 
 
 def passes(root: Path, tests: Path, marker: str) -> bool:
-    """Whether the tests with this mark pass in a copy of the checkout."""
     line = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", marker]
     options = {"cwd": root, "env": {**os.environ, "PYTHONPATH": str(root)}, "capture_output": True}
     try:
@@ -152,7 +148,6 @@ def survives(root: Path, mutant: Mutant) -> bool:
 
 
 def copy_checkout(folder: str) -> Path:
-    """Copy the files that git tracks."""
     names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     root = Path(folder) / "copy"
     for name in names.decode().split("\0"):

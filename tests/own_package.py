@@ -1,7 +1,5 @@
 """The example package of docs/examples, for one test at a time."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

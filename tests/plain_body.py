@@ -1,7 +1,5 @@
 """A body posed joint by joint in NumPy, to compare the package's kinematics with."""
 
-from __future__ import annotations
-
 import numpy as np
 import tiny
 

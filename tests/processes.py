@@ -1,7 +1,5 @@
 """Processes that tests start; all of them end with their test file."""
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os
@@ -9,6 +7,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, TypeVar
@@ -62,7 +61,6 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
 
 
 def finished(line: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a process to its end."""
     return subprocess.run(line, capture_output=True, text=True, check=False, timeout=PATIENCE, **options)
 
 
@@ -83,7 +81,6 @@ class Forked(ForkServerProcess):
         return self.exitcode
 
     def wait(self, timeout: float = PATIENCE) -> int | None:
-        """Return the exit code once the process has ended."""
         self.join(timeout)
         return self.exitcode
 
@@ -126,14 +123,11 @@ def interrupts(handler: Any) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def hearing_interrupts() -> contextlib.AbstractContextManager[None]:
-    """Start processes as from a terminal, even if this one ignores SIGINT (nohup, or `&`)."""
-    return interrupts(signal.default_int_handler)
+hearing_interrupts = partial(interrupts, signal.default_int_handler)
+"""Start processes as from a terminal, even if this one ignores SIGINT (nohup, or `&`)."""
 
-
-def ignoring_interrupts() -> contextlib.AbstractContextManager[None]:
-    """Start processes as nohup does: they ignore SIGINT unless they handle it."""
-    return interrupts(signal.SIG_IGN)
+ignoring_interrupts = partial(interrupts, signal.SIG_IGN)
+"""Start processes as nohup does: they ignore SIGINT unless they handle it."""
 
 
 def until(condition: Callable[[], T], what: str, process: subprocess.Popen | Forked | None = None) -> T:

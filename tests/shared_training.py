@@ -1,7 +1,5 @@
 """Trainings that processes of tests share."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable
@@ -18,15 +16,11 @@ from memmlp.training.optim import Muon, Optim, ScheduleFree
 from memmlp.training.train_network import VQVAETask
 
 STEPS = replace(OPTIM, steps=14, checkpoint_every=6, validate_every=7)
-OPTIMS = {
-    "muon": Muon(**asdict(replace(STEPS, ema=0.9))),
-    "schedule_free": ScheduleFree(**asdict(STEPS)),
-}
+OPTIMS = {"muon": Muon(**asdict(replace(STEPS, ema=0.9))), "schedule_free": ScheduleFree(**asdict(STEPS))}
 DEATH = 9  # the step at which the second process dies
 
 
 def optim_of(name: str) -> Optim:
-    """The optimiser of a task."""
     return OPTIMS.get(name, STEPS)
 
 

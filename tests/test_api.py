@@ -1,7 +1,5 @@
 """What a script or a notebook does with finished runs."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shutil
@@ -24,15 +22,21 @@ from memmlp.runs.lookup import list_runs
 
 ROOT = Path(memmlp.__file__).parents[1]
 NAMES = [
-    "InputError", "Offsets", "Pose", "Prediction", "Runs", "SampleWarning", "Stream", "TrainedRun",
+    "InputError",
+    "Offsets",
+    "Pose",
+    "Prediction",
+    "Runs",
+    "SampleWarning",
+    "Stream",
+    "TrainedRun",
     "load_run",
-]  # fmt: skip
+]
 UPRIGHT = ((0.0, 1.6, 0.0), np.eye(3))
 
 
 @pytest.fixture(scope="module")
 def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the folder with one finished run, for all tests here: none of them changes it."""
     return Path(shutil.copytree(tiny_home, tmp_path_factory.mktemp("home") / "home"))
 
 
@@ -75,24 +79,8 @@ def refused(*words: str) -> contextlib.AbstractContextManager[object]:
     return pytest.raises(memmlp.InputError, match=r"^(?![\s\S]*\n)" + ".*".join(map(re.escape, words)))
 
 
-def test_load_run_takes_ids_prefixes_and_folders(
-    run: memmlp.TrainedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    for name in (run.id, run.id[:6], run.folder, f"outputs/runs/{run.id}", run):
-        found = memmlp.load_run(name, "outputs")
-        assert (found.id, found.folder) == (run.id, run.folder)
-    assert memmlp.load_run(run.id).id == memmlp.Runs()[0].id == run.id
-    monkeypatch.setenv("MEMMLP_OUTPUTS", str(tmp_path))
-    with refused(f"run '{run.id}'", str(tmp_path)):
-        memmlp.load_run(run.id)
-    with refused("outputs", str(tmp_path)):
-        memmlp.Runs()
-    (tmp_path / "runs").mkdir()
-    assert len(memmlp.Runs()) == 0
-
-
-def test_load_run_refuses_unfinished_and_other_runs(
-    run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path
+def test_load_run_takes_ids_prefixes_and_folders_of_finished_runs(
+    run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     (codes,) = [found for found in list_runs("outputs") if found.id != run.id]
     for name, word in (("nobody", "nobody"), ("", "''"), (codes.id, "a finished run of a motion network")):
@@ -102,6 +90,18 @@ def test_load_run_refuses_unfinished_and_other_runs(
     assert [found.seed for found in memmlp.Runs(tmp_path)] == [1, 2]
     with refused(f"run {run.id}", "a finished run"):
         memmlp.load_run(run.id, tmp_path)
+    for name in (run.id, run.id[:6], run.folder, f"outputs/runs/{run.id}", run):
+        found = memmlp.load_run(name, "outputs")
+        assert (found.id, found.folder) == (run.id, run.folder)
+    assert memmlp.load_run(run.id).id == memmlp.Runs()[0].id == run.id
+    empty = tmp_path / "empty"
+    monkeypatch.setenv("MEMMLP_OUTPUTS", str(empty))
+    with refused(f"run '{run.id}'", str(empty)):
+        memmlp.load_run(run.id)
+    with refused("outputs", str(empty)):
+        memmlp.Runs()
+    (empty / "runs").mkdir(parents=True)
+    assert len(memmlp.Runs()) == 0
 
 
 def test_runs_are_a_sequence_with_the_newest_first(three: memmlp.Runs):
@@ -199,31 +199,44 @@ class Still(Term): pass
 """
 
 
-def test_user_code_runs_only_if_the_script_names_its_package(
-    three: memmlp.Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_user_code_runs_only_if_the_script_names_its_package(three, tmp_path: Path, monkeypatch):
     """A run's record cannot import anything, not even a module in the current folder."""
     (tmp_path / "mine.py").write_text(STILL)
     monkeypatch.syspath_prepend(tmp_path)
-    folder = three[0].folder
-    config = yaml.safe_load((folder / "config.yaml").read_text())
-    term = {"name": "still", "weight": 1.0}
-    (folder / "config.yaml").write_text(yaml.safe_dump({**config, "plugins": ["mine"], "term": term}))
+    path = three[0].folder / "config.yaml"
+    changes = {"plugins": ["mine"], "term": {"name": "still", "weight": 1.0}}
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | changes))
     with registers_kept():
         with pytest.raises(memmlp.InputError, match=r"trust it, .* in Python plugins=\['mine'\]"):
-            _ = memmlp.load_run(folder).model
+            _ = memmlp.load_run(path.parent).model
         assert "mine" not in sys.modules
-        assert not memmlp.load_run(folder, plugins=["mine"]).model.training
+        assert not memmlp.load_run(path.parent, plugins=["mine"]).model.training
     with registers_kept():
-        (found,) = (run for run in memmlp.Runs(tmp_path, plugins=["mine"]) if run.folder == folder)
+        (found,) = (run for run in memmlp.Runs(tmp_path, plugins=["mine"]) if run.folder == path.parent)
         assert found.clips
-    with pytest.raises(memmlp.InputError, match=r"plugins 'mine': expected a list of names, \['mine'\]"):
-        memmlp.load_run(folder, plugins="mine")
-    with pytest.raises(memmlp.InputError, match=r"plugin nowhere: not found"):
-        memmlp.load_run(folder, plugins=["nowhere"])
+    for plugins, said in (
+        ("mine", "plugins 'mine': expected a list of"),
+        (["nowhere"], "plugin nowhere: not"),
+    ):
+        with pytest.raises(memmlp.InputError, match=said):
+            memmlp.load_run(path.parent, plugins=plugins)
 
 
-def test_pictures_and_films(prediction: memmlp.Prediction, tmp_path: Path):
+def test_pictures_films_and_what_is_refused_of_them(prediction: memmlp.Prediction, tmp_path: Path):
+    for name, options, words in (
+        ("a.avi", {}, ("path ", "a.avi", ".png, .gif, .mp4")), ("no/a.png", {}, ("path ", "no")),
+        ("a.png", {"branch": "combined"}, ("branch combined", "rotation, position")),
+        ("a.png", {"begin": 900}, ("begin 900",)), ("a.png", {"begin": -1}, ("begin -1",)),
+        ("a.png", {"begin": float("nan")}, ("begin nan",)),
+        ("a.png", {"begin": 1, "end": 1}, ("begin 1 end 1",)),
+        ("a.png", {"begin": 0.501, "end": 0.505}, ("begin 0.501 end 0.505",)),
+        ("a.png", {"poses": 0}, ("poses 0", "1 to 20")),
+    ):  # fmt: skip
+        with refused(*words):
+            prediction.draw(tmp_path / name, **options)
+    with refused("path ", "a.fbx", ".bvh, .npz, .glb"):
+        prediction.save(tmp_path / "a.fbx")
+    assert list(tmp_path.iterdir()) == []
     one, two = (prediction.draw(tmp_path / f"{n}.png", poses=n) for n in (1, 2))
     assert one == tmp_path / "1.png"
     with Image.open(one) as narrow, Image.open(two) as wide:
@@ -231,25 +244,6 @@ def test_pictures_and_films(prediction: memmlp.Prediction, tmp_path: Path):
     assert prediction.draw(tmp_path / "3.png", poses=1, branch="position").read_bytes() != one.read_bytes()
     with Image.open(prediction.draw(str(tmp_path / "film.gif"), begin=0.5, end=0.6)) as film:
         assert film.n_frames == 3
-
-
-def test_bad_input_to_pictures_and_files_is_refused(prediction: memmlp.Prediction, tmp_path: Path):
-    for name, options, words in (
-        ("a.avi", {}, ("path ", "a.avi", ".png, .gif, .mp4")),
-        ("no/a.png", {}, ("path ", "no")),
-        ("a.png", {"branch": "combined"}, ("branch combined", "rotation, position")),
-        ("a.png", {"begin": 900}, ("begin 900",)),
-        ("a.png", {"begin": -1}, ("begin -1",)),
-        ("a.png", {"begin": float("nan")}, ("begin nan",)),
-        ("a.png", {"begin": 1, "end": 1}, ("begin 1 end 1",)),
-        ("a.png", {"begin": 0.501, "end": 0.505}, ("begin 0.501 end 0.505",)),
-        ("a.png", {"poses": 0}, ("poses 0", "1 to 20")),
-    ):
-        with refused(*words):
-            prediction.draw(tmp_path / name, **options)
-    with refused("path ", "a.fbx", ".bvh, .npz, .glb"):
-        prediction.save(tmp_path / "a.fbx")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_motion_is_saved_as_bvh_gltf_and_npz(prediction: memmlp.Prediction, tmp_path: Path):

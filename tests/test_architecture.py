@@ -1,7 +1,5 @@
 """The sources that make up a run's code version, and asserted refusals."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The wheel and the source distribution, installed in a new environment outside the checkout (make dist)."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

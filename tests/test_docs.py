@@ -1,7 +1,5 @@
 """Documentation is correct: commands parse and compose, links lead somewhere, numbers have a source."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import runpy
@@ -58,7 +56,6 @@ class Line(NamedTuple):
 
 
 def blocks(path: Path, *languages: str) -> Iterator[tuple[int, str]]:
-    """The code blocks in some languages, with the number of their first line."""
     text = path.read_text(encoding="utf-8")
     for found in BLOCK.finditer(text):
         if found[1] in languages:
@@ -93,16 +90,13 @@ def test_commands_are_valid(line: Line, on_path: Path, tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "line",
-    [
-        "memmlp trian", "memmlp train memry=none", "memmlp train -m seed=0,x", "memmlp sweep 14 --jobs 3",
-        "memmlp sweep 14 memory.shift=day", "memmlp sweep 99", "memmlp export RUN --opset 9",
-        "memmlp runs lost", "memmlp table 14 --format doc", "memmlp tune search.n_trial=3",
-        "memmlp sweep 14 executor=slurm slurm.nodes=3", "make everything", "node docs/examples/none.mjs",
-        "python docs/examples/vmc/receive.py --prt 1",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("line", [
+    "memmlp trian", "memmlp train memry=none", "memmlp train -m seed=0,x", "memmlp sweep 14 --jobs 3",
+    "memmlp sweep 14 memory.shift=day", "memmlp sweep 99", "memmlp export RUN --opset 9",
+    "memmlp runs lost", "memmlp table 14 --format doc", "memmlp tune search.n_trial=3",
+    "memmlp sweep 14 executor=slurm slurm.nodes=3", "make everything", "node docs/examples/none.mjs",
+    "python docs/examples/vmc/receive.py --prt 1",
+])  # fmt: skip
 def test_invalid_commands_are_refused(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(Exception, match=r"\S"):
@@ -202,7 +196,6 @@ def compose_sweep(values: dict[str, Any]) -> None:
 
 
 def compose_search(overrides: Sequence[str]) -> None:
-    """Compose a search, and the config of its first trial."""
     words = split_executor(overrides)[2]
     own = [word for word in words if word.lstrip("+~").startswith("search")]
     search = parse_search(compose_plain("tune", own)["search"])
@@ -263,11 +256,15 @@ def anchors(path: Path) -> set[str]:
     return slugs | set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
 
 
-def test_extras_are_those_of_the_package():
+def test_extras_and_metrics_are_those_of_the_package():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for page in PAGES:
         for extra in re.findall(r"(?:memmlp|'\.)\[(\w+)\]", page.read_text(encoding="utf-8")):
             assert extra in extras, f"{page}: {extra}"
+    text = (DOCS / "guides/runs.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(.+?)` \| (.+?) \| (.+?) \|", text, re.MULTILINE)
+    listed = {name: (unit, float(smallest)) for name, unit, smallest in rows if name in UNITS}
+    assert listed == {name: (UNITS[name], SMALLEST[name]) for name in UNITS if name != "GT Jitter"}
 
 
 def test_numbers_in_readme_are_in_the_linked_results():
@@ -285,7 +282,6 @@ def test_numbers_in_readme_are_in_the_linked_results():
 
 @pytest.fixture
 def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The generator of the reference pages."""
     monkeypatch.syspath_prepend(DOCS)
     return importlib.import_module("reference")
 
@@ -329,13 +325,6 @@ def test_examples_of_the_guides_work(tmp_path: Path, monkeypatch: pytest.MonkeyP
         compose_config(one.overrides)
     skeleton = yaml.safe_load(examples("motion", "yaml")[0])
     assert set(skeleton) == set(SkeletonMap.__dataclass_fields__)
-
-
-def test_the_guide_lists_every_metric():
-    text = (DOCS / "guides/runs.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `(.+?)` \| (.+?) \| (.+?) \|", text, re.MULTILINE)
-    listed = {name: (unit, float(smallest)) for name, unit, smallest in rows if name in UNITS}
-    assert listed == {name: (UNITS[name], SMALLEST[name]) for name in UNITS if name != "GT Jitter"}
 
 
 def test_the_first_quickstart_lists_every_option():

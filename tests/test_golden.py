@@ -1,7 +1,5 @@
 """Components compute the numbers of their versions."""
 
-from __future__ import annotations
-
 import golden
 import pytest
 from golden import changed, tolerance

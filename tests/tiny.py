@@ -1,10 +1,6 @@
 """Tiny motion and tiny networks that the tests share."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +21,6 @@ from memmlp.networks.predictor import TwoBranchSettings
 from memmlp.networks.recurrent_poser import RecurrentPoser, RecurrentPoserSettings
 from memmlp.networks.refiner import RefinedModel
 from memmlp.networks.vqvae import VQVAE
-from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, LossOfNetwork, RPMLoss, TermsLoss
 
 SIZES = {"hidden": 16, "frames": 7}
 DEPTH = 4
@@ -45,7 +40,6 @@ def clip(length: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
 
 
 def frames(lengths: tuple[int, ...] = (60, 45, 80), seed: int = 0) -> MotionDataset:
-    """Make a dataset with clips of these lengths."""
     clips = [clip(length, seed + i) for i, length in enumerate(lengths)]
     starts = torch.tensor([0, *np.cumsum(lengths)[:-1]])
     return MotionDataset(
@@ -61,7 +55,6 @@ def normalizer(coordinates: World | None = None) -> Normalizer:
 
 
 def vqvae() -> VQVAE:
-    """Make a VQ-VAE with random code-vectors."""
     torch.manual_seed(3)
     model = VQVAE(codes=8, width=12, encoder_depth=2)
     model.codebook.vectors.normal_()
@@ -128,24 +121,6 @@ BASELINES: dict[str, dict[str, Any]] = {
         diffusion_steps=50, sampling_steps=2, noise=0.01, noise_seed=0,
     ),
 }  # fmt: skip
-BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
-    "agrol_mlp": AGRoLLoss,
-    "agrol_diffusion": AGRoLLoss,
-    "bodiffusion": LossOfNetwork,
-    "avatar_poser": AvatarPoserLoss,
-    "ego_poser": partial(TermsLoss, orientation=0.02, rotation=1.0, position_from_pelvis=1.0),
-    "hmd_poser": partial(
-        TermsLoss, orientation=1.0, rotation=5.0, global_rotation=1.0, world_position=1.0, acceleration=0.5
-    ),
-    "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position_from_pelvis=20.0, angle=0.1),
-    "avatar_jlm": partial(
-        TermsLoss, rotation=2.0, position_from_pelvis=5.0, velocity_3=16.0, contact=20.0, hand=5.0
-    ),
-    "rpm": RPMLoss,
-    "sage": partial(TermsLoss, "norm", orientation=0.02, rotation=1.0, world_position=5.0),
-    "manikin_s": partial(TermsLoss, orientation=0.02),
-    "manikin_l": partial(TermsLoss, orientation=0.02, world_position=40.0, velocity=50.0, hand=5.0),
-}
 
 
 def tiny_sizes(name: str) -> dict[str, Any]:
@@ -160,25 +135,21 @@ def tiny_sizes(name: str) -> dict[str, Any]:
 
 for new in set(list_component_names("model")) - {*BASELINES, "mem_mlp", "recurrent_poser", "constant_pose"}:
     BASELINES[new] = tiny_sizes(new)
-    BASELINE_LOSSES[new] = partial(TermsLoss, rotation=1.0)
 WINDOWLESS = [name for name in BASELINES if issubclass(find_component("model", name).kind, WindowlessModel)]
 """Baselines without a window, which are streams in both modes of evaluation."""
 
 
 def build_baseline(name: str, normalizer: Normalizer, **changes) -> MotionModel:
-    """Make a tiny baseline."""
     network = find_component("model", name)
     return network.kind(normalizer, network.make_settings(BASELINES[name] | changes))
 
 
 def baseline(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> MotionModel:
-    """Make a tiny baseline with random weights, in evaluation mode."""
     torch.manual_seed(seed)
     return build_baseline(name, normalizer(coordinates), **changes).eval()
 
 
 def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) -> RecurrentPoser:
-    """Make a tiny RecurrentPoser with random weights, in evaluation mode."""
     torch.manual_seed(seed)
     settings = {
         "frames": 7, "width": 16, "depth": 2, "cell": "gru", "expansion": 2, "output": "local", "members": 1,

@@ -1,7 +1,5 @@
 """Tiny training tasks of every kind, and their optimisers."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import tiny
@@ -9,17 +7,38 @@ import torch
 from torch import nn
 
 from memmlp.networks import checkpoint
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import JointCodeMemory
 from memmlp.networks.sage_parts import LOWER, UPPER
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
-from memmlp.training.losses import MotionLoss, PositionHandTerm, TermsLoss, UncertaintyWeights
+from memmlp.training.losses import (
+    AGRoLLoss,
+    AvatarPoserLoss,
+    Loss,
+    LossOfNetwork,
+    MotionLoss,
+    PositionHandTerm,
+    RPMLoss,
+    TermsLoss,
+    UncertaintyWeights,
+)
 from memmlp.training.optim import Optim
-from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
 from memmlp.training.train_network import MotionTask, NetworkTraining, VQVAETask
 from memmlp.training.train_sage import PARTS, SAGEPartTask, make_objective
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
+HMD_POSER = {
+    "orientation": 1.0, "rotation": 5.0, "global_rotation": 1.0, "world_position": 1.0, "acceleration": 0.5,
+}  # fmt: skip
+LOSSES = {
+    "hmd_poser": partial(TermsLoss, **HMD_POSER),
+    "rpm": RPMLoss,
+    "avatar_poser": AvatarPoserLoss,
+    "agrol_diffusion": AGRoLLoss,
+    "bodiffusion": LossOfNetwork,
+}
 ROLLOUTS = {
     "forced": TeacherForcing,
     "own": lambda: OwnPredictions(2),
@@ -27,26 +46,26 @@ ROLLOUTS = {
 }
 
 
-def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0, **changes) -> MotionTask:
-    model, made = tiny.model(seed=seed, **changes), ROLLOUTS[rollout]()
-    if isinstance(made, PersistentStreams):
-        made.begin(model)
-    loss = MotionLoss(UncertaintyWeights(), PositionHandTerm(), model.predictor.branches)
-    return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
-
-
-def baseline_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
-    model, loss = tiny.baseline(name, seed=seed, depth=1), tiny.BASELINE_LOSSES[name]()
+def make_task(model: MotionModel, loss: Loss, rollout: Rollout, optim: Optim, seed: int = 0) -> MotionTask:
+    rollout.begin(model)
     return MotionTask(
-        model, loss, TeacherForcing(), tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0}
+        model, loss, rollout, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0}
     )
 
 
-def recurrent_task(rollout: str = "forced", optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
-    model, made = tiny.recurrent_poser(seed=seed, members=2), ROLLOUTS[rollout]()
-    made.begin(model)
+def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0, **changes) -> MotionTask:
+    model = tiny.model(seed=seed, **changes)
+    loss = MotionLoss(UncertaintyWeights(), PositionHandTerm(), model.predictor.branches)
+    return make_task(model, loss, ROLLOUTS[rollout](), optim, seed)
+
+
+def baseline_task(name: str, optim: Optim = OPTIM) -> MotionTask:
+    return make_task(tiny.baseline(name, depth=1), LOSSES[name](), TeacherForcing(), optim)
+
+
+def recurrent_task(rollout: str = "forced", optim: Optim = OPTIM) -> MotionTask:
     loss = TermsLoss(weighting="learned", rotation=1.0, world_position=2.0, velocity=20.0)
-    return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
+    return make_task(tiny.recurrent_poser(members=2), loss, ROLLOUTS[rollout](), optim)
 
 
 def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
@@ -74,8 +93,8 @@ def weights(run: Run) -> dict[str, torch.Tensor]:
 
 TASKS = {
     **{name: partial(motion_task, name) for name in ROLLOUTS},
-    **{name: partial(baseline_task, name) for name in tiny.BASELINES},
-    **{f"recurrent {name}": partial(recurrent_task, name) for name in ("forced", "streams")},
+    **{name: partial(baseline_task, name) for name in LOSSES},
+    "recurrent forced": recurrent_task,
     "muon": partial(motion_task, "forced"),
     "schedule_free": partial(motion_task, "forced"),
     "vqvae": vqvae_task,

@@ -3,8 +3,6 @@
 It reads OSC as docs/examples/vmc/receive.py does, which is independent of python-osc.
 """
 
-from __future__ import annotations
-
 import runpy
 import socket
 from pathlib import Path
@@ -60,7 +58,6 @@ class Marionette:
         return found
 
     def positions(self) -> dict[str, np.ndarray]:
-        """The bones' positions in Unity's world."""
         return {name: at[0] for name, at in posed(self.root, self.bones).items()}
 
     def close(self) -> None:

@@ -1,7 +1,5 @@
 """A person who moves smoothly, and streams of that motion, for tests of memmlp.live."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@
 Exits with 1 where they differ. tests/kills runs the same with a few kills.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import random
@@ -94,7 +92,6 @@ def search_storm(
 
 
 def start(arguments: Sequence[str], outputs: Path, workers: int) -> subprocess.Popen[bytes]:
-    """Start a `memmlp` process that works on a sweep or search."""
     line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", *arguments]
     line += ["--workers", str(workers), "--outputs", str(outputs)]
     return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -136,7 +133,6 @@ def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: ra
 
 
 def compare(calm: Path, stormy: Path) -> list[str]:
-    """List what is wrong in the disturbed sweep's outputs."""
     expected, found = ({run.id: run for run in list_runs(outputs)} for outputs in (calm, stormy))
     problems = [f"run {name} is missing" for name in expected.keys() - found.keys()]
     problems += [f"run {name} should not be" for name in found.keys() - expected.keys()]

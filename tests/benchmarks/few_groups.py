@@ -4,8 +4,6 @@ docs/results/verdicts.md has the output of `python tests/benchmarks/few_groups.p
 Axes of arrays: K comparisons, S seeds, G groups.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 

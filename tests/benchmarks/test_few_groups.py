@@ -1,7 +1,5 @@
 """The simulation of few groups decides as the p-values do, from differences of variance 1."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.few_groups import (

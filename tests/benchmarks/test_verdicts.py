@@ -1,7 +1,5 @@
 """Simulated differences have the documented variances, and broken promises are counted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.verdicts import SHARES, Shares, Simulated, SimulationSetting, broken, draw, grid, simulate

@@ -4,8 +4,6 @@ Run `python tests/benchmarks/verdicts.py --tables 5000 --seed 20253`; docs/resul
 Axes of arrays: K comparisons (T tables of TABLE each), S seeds, C clips, G clip groups.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -168,27 +166,26 @@ def grid() -> list[SimulationSetting]:
     return [cell for cell in cells if cell.groups[-1] > 0]
 
 
-class SimulatedOutcomes(NamedTuple):
-    """Outcomes in simulated tables with true differences of zero."""
-
-    covered: np.ndarray  # whether the 95 % interval covers the truth (K,)
-    starred: np.ndarray  # whether a table has a (false) star, with all seeds at once (T,)
-    sequential: np.ndarray  # the same with interim analyses (T,)
-    found: np.ndarray  # the smallest true effect that would have been found at Holm's first step (K,)
-
-
-def count(sample: Simulated, shares: Shares) -> SimulatedOutcomes:
-    """Count the outcomes in one sample with effects in these shares.
+def count(sample: Simulated, shares: Shares) -> dict[str, np.ndarray]:
+    """Count the outcomes in one sample with effects in these shares, whose true differences are zero.
 
     All nulls are true, so Holm gives a table a star exactly if its first step does.
+
+    Returns:
+        covered: whether the 95 % interval covers the truth (K,).
+        starred, sequential: whether a table has a (false) star, with all seeds at once or with interim
+            analyses (T,).
+        found: the smallest true effect that would have been found at Holm's first step (K,).
     """
     sequential = np.zeros(len(sample.seeds), bool)
     for seeds, level in levels(sample):
         known, mean = sample.mixed(shares, seeds)
         sequential |= np.abs(mean) > known.compute_half_width(level / TABLE)
     half = known.compute_half_width(LEVEL / TABLE)
-    covered = np.abs(mean) <= known.compute_half_width(LEVEL)
-    return SimulatedOutcomes(covered, _any(np.abs(mean) > half), _any(sequential), half - mean)
+    return {
+        "covered": np.abs(mean) <= known.compute_half_width(LEVEL),
+        "starred": _any(np.abs(mean) > half), "sequential": _any(sequential), "found": half - mean,
+    }  # fmt: skip
 
 
 def levels(sample: Simulated) -> Iterator[tuple[int, float]]:
@@ -201,36 +198,36 @@ def _any(claims: np.ndarray) -> np.ndarray:
     return np.any(claims.reshape(-1, TABLE), axis=1)
 
 
-def summary(counts: Sequence[SimulatedOutcomes]) -> dict[str, float]:
+def join(counts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate([part[name] for part in counts]) for name in counts[0]}
+
+
+def summary(counts: Sequence[dict[str, np.ndarray]]) -> dict[str, float]:
     """Return the rates over all samples, and the power.
 
     Power is the share of comparisons that find the effect which an oracle, who knows the variances, finds in
     80 % of tables. `effect_ratio` is the effect found in 80 % of tables, divided by the oracle's.
     """
-    covered, starred, sequential, found = map(np.concatenate, zip(*counts, strict=True))
-    oracle = ndtri(1 - LEVEL / TABLE / 2) + ndtri(0.8)
+    of, oracle = join(counts), ndtri(1 - LEVEL / TABLE / 2) + ndtri(0.8)
     return {
-        "coverage": float(covered.mean()),
-        "error": float(starred.mean()),
-        "sequential_error": float(sequential.mean()),
-        "power": float((found < oracle).mean()),
-        "effect_ratio": float(np.quantile(found, 0.8) / oracle),
+        "coverage": float(of["covered"].mean()),
+        "error": float(of["starred"].mean()),
+        "sequential_error": float(of["sequential"].mean()),
+        "power": float((of["found"] < oracle).mean()),
+        "effect_ratio": float(np.quantile(of["found"], 0.8) / oracle),
     }
 
 
-class Campaign(NamedTuple):
-    """Outcomes in simulated tables that spend seeds until everything is decided."""
-
-    seeds: np.ndarray  # the number of seeds that each variant spent (T, VARIANTS)
-    decided: np.ndarray  # whether each comparison was decided in an interim analysis (T, TABLE)
-    at_once: np.ndarray  # whether each is decided with all seeds at once (T, TABLE)
-    false: np.ndarray  # whether a table made any false claim in an interim analysis (T,)
-
-
-def campaign(sample: Simulated, shares: Shares) -> Campaign:
+def campaign(sample: Simulated, shares: Shares) -> dict[str, np.ndarray]:
     """Simulate tables with interim analyses; half of the variants differ by EFFECT.
 
     A variant stops when all of its comparisons are decided.
+
+    Returns:
+        seeds: the number of seeds that each variant spent (T, VARIANTS).
+        decided, decided_at_once: whether each comparison was decided in an interim analysis, and with all
+            seeds at once (T, TABLE).
+        error: whether a table made any false claim in an interim analysis (T,).
     """
     tables = len(sample.seeds) // TABLE
     truth = np.repeat(np.arange(VARIANTS) % 2 * EFFECT, METRICS)
@@ -247,11 +244,9 @@ def campaign(sample: Simulated, shares: Shares) -> Campaign:
         now_same = _claimed(q, same, differ, level)
         differ = _claimed(p, differ, now_same, level)
         same = now_same
-    at_once = np.array(
-        [(correct_by_holm(x) <= LEVEL) | (correct_by_holm(y) <= LEVEL) for x, y in zip(p, q, strict=True)]
-    )
+    at_once = [np.minimum(correct_by_holm(x), correct_by_holm(y)) <= LEVEL for x, y in zip(p, q, strict=True)]
     false = (differ & (truth == 0) | same & (truth > 0)).any(1)
-    return Campaign(seeds, differ | same, at_once, false)
+    return {"seeds": seeds, "decided": differ | same, "decided_at_once": np.array(at_once), "error": false}
 
 
 def _claimed(p: np.ndarray, before: np.ndarray, closed: np.ndarray, level: float) -> np.ndarray:
@@ -272,8 +267,8 @@ def simulate(cell: SimulationSetting, tables: int, seed: int) -> dict[str, Any]:
     rng = np.random.default_rng([seed, *cell])
     size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))
     every = choices(cell)
-    counts: dict[str, list[SimulatedOutcomes]] = {name: [] for name in every}
-    campaigns: list[Campaign] = []
+    counts: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in every}
+    campaigns: list[dict[str, np.ndarray]] = []
     for start in range(0, tables, size):
         sample = Simulated(rng, cell, TABLE * min(size, tables - start))
         for name, shares in every.items():
@@ -285,15 +280,8 @@ def simulate(cell: SimulationSetting, tables: int, seed: int) -> dict[str, Any]:
         "groups": int(cell.groups[-1]) + 1,
         "tables": tables,
         "shares": {name: summary(parts) for name, parts in counts.items()},
-        "campaign": averages(campaigns),
+        "campaign": {name: float(values.mean()) for name, values in join(campaigns).items()},
     }
-
-
-def averages(campaigns: Sequence[Campaign]) -> dict[str, float]:
-    """Return means over simulated tables that spend seeds until everything is decided."""
-    names = ("seeds", "decided", "decided_at_once", "error")
-    parts = zip(*campaigns, strict=True)
-    return {name: float(np.concatenate(part).mean()) for name, part in zip(names, parts, strict=True)}
 
 
 def extreme(row: dict[str, Any], what: str, pick: Any) -> tuple[float, str]:
@@ -318,9 +306,7 @@ def broken(row: dict[str, Any], capped: bool) -> list[str]:
     ]
 
 
-HEADER = (
-    "design", "coverage", "star", "of", "interim", "power", "effect", "seeds", "decided",
-)  # fmt: skip
+HEADER = ["design", "coverage", "star", "of", "interim", "power", "effect", "seeds", "decided"]
 
 
 def columns(row: dict[str, Any]) -> list[str]:

@@ -1,7 +1,5 @@
 """Declarations are found by name and read without torch, from memmlp and from users' packages."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -74,11 +72,13 @@ def test_all_settings_are_read_without_torch():
     assert ran.stdout == "False False\n"
 
 
-def test_every_shipped_component_can_be_imported():
+def test_every_shipped_component_can_be_imported_and_others_are_refused():
     for (slot, name), one in collect_components().items():
         assert callable(one.kind), (slot, name)
         assert one.settings.option == f"{slot}={name}"
     assert set(SLOTS) - {"term"} <= {slot for slot, _ in collect_components()}
+    with pytest.raises(InputError, match=r"memory=mamba: must be gru or lstm"):
+        find_component("memory", "mamba")
 
 
 def test_declared_settings_and_those_of_the_module_are_the_same():
@@ -117,23 +117,16 @@ def test_a_package_adds_components_whose_settings_extend_each_other(package: Pat
         assert "one" not in list_component_names("memory")
 
 
-def test_an_option_is_declared_once(package: Path):
+def test_an_option_is_declared_once_and_settings_need_no_module(package: Path):
     (package / "again.py").write_text('\n@component("memory", "gru")\nclass Mine: pass\n')
     with registers_kept():
         with pytest.raises(InputError, match=r"again\.py: memory=gru exists already"):
             add_package("mine", package)
         assert find_component("memory", "gru").package == "memmlp"
-
-
-def test_settings_that_need_the_module_are_an_error(package: Path):
+    (package / "again.py").unlink()
     text = BASE.replace("setting(default=NUMBER)", "setting(default=COMPUTED)")
     (package / "base.py").write_text(text)
     with registers_kept():
         add_package("mine", package)
         with pytest.raises(InputError, match=r"base\.py: .*COMPUTED"):
             _ = find_component("memory", "one").settings
-
-
-def test_an_unknown_option_is_one_line_with_the_known_ones():
-    with pytest.raises(InputError, match=r"memory=mamba: must be gru or lstm"):
-        find_component("memory", "mamba")

@@ -1,7 +1,5 @@
 """Pinned npm packages: where they are fetched from, that their digest is checked, and what is said if not."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io
@@ -18,7 +16,6 @@ FILES = {"package/package.json": b"{}", "package/dist/a.js": b"let a;", "package
 
 
 def packed(files: dict[str, bytes]) -> bytes:
-    """A tarball."""
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w:gz") as archive:
         for name, content in files.items():
@@ -30,7 +27,6 @@ def packed(files: dict[str, bytes]) -> bytes:
 
 @pytest.fixture
 def package() -> tuple[Package, bytes]:
-    """A package of a scope, and its tarball."""
     content = packed(FILES)
     digest = base64.b64encode(hashlib.sha512(content).digest()).decode()
     return Package("@scope/name", "1.2.3", f"sha512-{digest}"), content
@@ -58,10 +54,8 @@ def serve(folder: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> Path
 def test_it_is_fetched_once_and_read_member_by_member(package, place, monkeypatch):
     pinned, content = package
     source = serve(place, content, monkeypatch)
-    assert npm.read_package_files(pinned, ["dist/a.js", "dist/b.js"]) == {
-        "dist/a.js": b"let a;",
-        "dist/b.js": b"let b;",
-    }
+    found = npm.read_package_files(pinned, ["dist/a.js", "dist/b.js"])
+    assert found == {"dist/a.js": b"let a;", "dist/b.js": b"let b;"}
     source.unlink()
     assert npm.read_package_files(pinned, ["package.json"]) == {"package.json": b"{}"}
     assert [path.name for path in (place / "cache" / "memmlp" / "npm").iterdir()] == ["scope-name-1.2.3.tgz"]
@@ -95,7 +89,5 @@ def test_a_folder_of_tarballs_comes_first(package, place, monkeypatch):
 @pytest.mark.parametrize("address", ["http://127.0.0.1:9/", "no address"])
 def test_a_registry_out_of_reach_is_one_line(package, address, monkeypatch):
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", address)
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError, match=r"^@scope/name@1.2.3: cannot be .*npm pack @scope/name@1.2.3"):
         npm.fetch_tarball(package[0])
-    assert str(told.value).startswith("@scope/name@1.2.3: cannot be downloaded from the npm registry (")
-    assert "npm pack @scope/name@1.2.3" in str(told.value)

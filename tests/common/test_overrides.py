@@ -1,21 +1,14 @@
 """An override is split once, and everything else reads its parts."""
 
-from __future__ import annotations
-
 import pytest
 
 from memmlp.common.overrides import Override, select_last_by_key
 
 
-@pytest.mark.parametrize(
-    ("text", "parts"),
-    [
-        ("optim.lr=1e-3", ("", "optim.lr", "1e-3", "optim")),
-        ("++term=a=b", ("++", "term", "a=b", "term")),
-        ("~loss.hand", ("~", "loss.hand", None, "loss")),
-        ("seed=", ("", "seed", "", "seed")),
-    ],
-)
+@pytest.mark.parametrize(("text", "parts"), [
+    ("optim.lr=1e-3", ("", "optim.lr", "1e-3", "optim")), ("++term=a=b", ("++", "term", "a=b", "term")),
+    ("~loss.hand", ("~", "loss.hand", None, "loss")), ("seed=", ("", "seed", "", "seed")),
+])  # fmt: skip
 def test_the_parts_of_an_override(text: str, parts: tuple[str, str, str | None, str]):
     override = Override.parse(text)
     assert (override.signs, override.key, override.value, override.group) == parts

@@ -1,7 +1,5 @@
 """Who may ask a page's server, and who may change something."""
 
-from __future__ import annotations
-
 from email.message import Message
 from urllib.parse import quote
 
@@ -21,53 +19,37 @@ def headers(**given: str) -> Message:
     return made
 
 
-@pytest.mark.parametrize(
-    ("host", "alone"),
-    [("127.0.0.1", True), ("localhost", True), ("127.0.0.2", True), ("0.0.0.0", False), ("::", False)],
-)
+@pytest.mark.parametrize(("host", "alone"), [
+    ("127.0.0.1", True), ("localhost", True), ("127.0.0.2", True), ("0.0.0.0", False), ("::", False),
+])  # fmt: skip
 def test_which_addresses_are_this_machine_s_alone(host: str, alone: bool):
     assert is_loopback(host) is alone
     assert (AccessRules(host).token is None) is alone
 
 
-@pytest.mark.parametrize(
-    ("given", "allowed"),
-    [
-        ({"Host": "127.0.0.1:8765"}, True),
-        ({"Host": "localhost"}, True),
-        ({"Host": "127.0.0.1.evil.example:80"}, False),
-        ({"Host": "evil.example:8765"}, False),
-        ({}, False),
-        ({"Host": "localhost", "Sec_Fetch_Site": "cross-site"}, False),
-        ({"Host": "localhost", "Sec_Fetch_Site": "same-origin"}, True),
-    ],
-)
+@pytest.mark.parametrize(("given", "allowed"), [
+    ({"Host": "127.0.0.1:8765"}, True), ({"Host": "localhost"}, True), ({}, False),
+    ({"Host": "127.0.0.1.evil.example:80"}, False), ({"Host": "evil.example:8765"}, False),
+    ({"Host": "localhost", "Sec_Fetch_Site": "cross-site"}, False),
+    ({"Host": "localhost", "Sec_Fetch_Site": "same-origin"}, True),
+])  # fmt: skip
 def test_this_machine_s_own_address(given: dict[str, str], allowed: bool):
     assert AccessRules("127.0.0.1").allows("/events", headers(**given), 8765) is allowed
 
 
-@pytest.mark.parametrize(
-    ("path", "cookie", "allowed"),
-    [
-        ("/", "", False),
-        ("/?token=", "", False),
-        ("/?token=wrong", "", False),
-        (f"/?token={quote(TOKEN)}", "", True),
-        ("/events", f"{COOKIE}_8765={quote(TOKEN)}", True),
-        ("/events", f"{COOKIE}_1={quote(TOKEN)}", False),
-        ("/events", f"{COOKIE}_8765=wrong", False),
-        ("/?token=%ff", "", False),
-    ],
-)
+@pytest.mark.parametrize(("path", "cookie", "allowed"), [
+    ("/", "", False), ("/?token=", "", False), ("/?token=wrong", "", False), ("/?token=%ff", "", False),
+    (f"/?token={quote(TOKEN)}", "", True), ("/events", f"{COOKIE}_8765={quote(TOKEN)}", True),
+    ("/events", f"{COOKIE}_1={quote(TOKEN)}", False), ("/events", f"{COOKIE}_8765=wrong", False),
+])  # fmt: skip
 def test_another_address_needs_the_token(path: str, cookie: str, allowed: bool):
     asked = headers(Host="192.168.1.5:8765", **({"Cookie": cookie} if cookie else {}))
     assert AccessRules("192.168.1.5", TOKEN).allows(path, asked, 8765) is allowed
 
 
-@pytest.mark.parametrize(
-    ("origin", "allowed"),
-    [(None, True), ("http://localhost:8765", True), ("http://localhost:8766", False), ("null", False)],
-)
+@pytest.mark.parametrize(("origin", "allowed"), [
+    (None, True), ("http://localhost:8765", True), ("http://localhost:8766", False), ("null", False),
+])  # fmt: skip
 def test_only_the_page_itself_changes_something(origin: str | None, allowed: bool):
     """A page of another site can send a form here, with the browser's cookies."""
     given = headers(Host="localhost:8765", **({"Origin": origin} if origin else {}))

@@ -1,7 +1,5 @@
 """Garbage collection, ends, imports of children, and the share of a core."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -31,7 +29,6 @@ def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def found(**environment: str) -> str:
-    """The package's file that a child imports."""
     line = [sys.executable, "-c", FILE]
     answer = subprocess.run(line, env=os.environ | environment, capture_output=True, text=True, check=True)
     return answer.stdout.strip()
@@ -41,7 +38,7 @@ def test_a_import_environment_the_same_package(foreign: Path):
     assert found(**build_import_variables()) == memmlp.__file__
 
 
-def test_an_end_that_has_begun_is_not_interrupted():
+def test_an_end_that_has_begun_is_not_interrupted_and_a_request_to_end_is_a_ctrl_c():
     ended = []
 
     def end() -> None:
@@ -54,9 +51,6 @@ def test_an_end_that_has_begun_is_not_interrupted():
         raise KeyboardInterrupt
     assert ended
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
-
-def test_a_request_to_end_is_a_ctrl_c():
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt), treat_termination_as_interrupt():
         signal.raise_signal(signal.SIGTERM)

@@ -1,19 +1,11 @@
 """What is said of long work where no terminal shows bars."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
 
 from memmlp.common import progress
-from memmlp.common.progress import (
-    label_progress,
-    notify,
-    progress_bar,
-    send_announcements_to,
-    show_progress,
-)
+from memmlp.common.progress import notify, send_announcements_to
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -32,7 +24,7 @@ def test_a_remark_is_shown_on_a_terminal_too(capsys, monkeypatch: pytest.MonkeyP
 def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
-    with send_announcements_to(told.append), show_progress("network", 4000, done=398) as count:
+    with send_announcements_to(told.append), progress.show_progress("network", 4000, done=398) as count:
         count.advance()
         count.set_note("loss 2.31")
         count.advance()
@@ -44,7 +36,7 @@ def test_a_line_names_the_unit_and_the_stage(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
     with send_announcements_to(told.append):
-        with label_progress("validation"):
-            list(progress_bar(iter("a"), "stream", unit="frames"))
-        list(progress_bar(iter("a"), "stream", unit="frames"))
+        with progress.label_progress("validation"):
+            list(progress.progress_bar(iter("a"), "stream", unit="frames"))
+        list(progress.progress_bar(iter("a"), "stream", unit="frames"))
     assert told == ["validation, stream: 1 frames", "stream: 1 frames"]

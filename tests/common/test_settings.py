@@ -1,7 +1,5 @@
 """The rules for the values of keys."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

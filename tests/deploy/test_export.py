@@ -43,6 +43,6 @@ def test_numbers_interface_and_metadata(naive_step):
     }
     props = {p.key: p.value for p in graph.metadata_props}
     assert json.loads(props["joints"]) == list(JOINTS)
-    assert (props["fps"], props["T"], props["run_id"]) == ("60", "7", "0123456789abcdef")
+    assert (props["fps"], props["T"], props["run_id"]) == ("60", "7", "0" * 16)
     assert "features" in props
     assert "memmlp_version" in props

@@ -1,10 +1,9 @@
 """Lower precisions: which layers have them, what they compute, and what they cost."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from types import SimpleNamespace
 
 import exported
 import numpy as np
@@ -14,21 +13,13 @@ import tiny
 from onnx import TensorProto, numpy_helper
 from onnxruntime import InferenceSession
 
-from memmlp.deploy.export import export
-from memmlp.deploy.lower_precision import (
-    ZERO,
-    compare_accuracy,
-    convert_to_int8_blocks,
-    find_inner_layers,
-    measure_accuracy,
-    quantise_in_blocks,
-    write_lower_precision,
-)
+from memmlp.common.errors import InputError
+from memmlp.deploy import lower_precision
+from memmlp.deploy.lower_precision import find_inner_layers, quantise_in_blocks, write_lower_precision
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import GraphConstants
 from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation import modes as evaluation
-from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.streaming import make_streaming_graph
 
 pytestmark = pytest.mark.slow
@@ -41,24 +32,16 @@ CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 def test_every_layer_between_the_ends_is_an_inner_one(step_files, network: str):
     """By the weights' values, whatever the exporter calls them, and whether it transposes them or not."""
     stream, graph = make_streaming_graph(exported.NETWORKS[network]()), onnx.load(step_files(network))
-    weights = {
-        name: weight.detach().numpy()
-        for name, weight in stream.named_parameters()
-        if name.endswith("weight") and weight.ndim == 2
-    }
+    named = [(name, weight) for name, weight in stream.named_parameters() if name.endswith("weight")]
+    weights = {name: weight.detach().numpy() for name, weight in named if weight.ndim == 2}
     ends = [weight for name, weight in weights.items() if name.startswith(stream.float32_modules)]
     inner, constants = set(find_inner_layers(graph, stream.float32_modules)), GraphConstants(graph.graph)
-    left = [
-        node.name
-        for node in graph.graph.node
-        if node.op_type in ("Gemm", "MatMul") and node.name not in inner and node.input[1] in constants
-        if _is_of(constants.get_value(node.input[1]), weights.values())
-        and not _is_of(constants.get_value(node.input[1]), ends)
-    ]
-    assert left == []
-    products = [constants.get_value(node.input[1]) for node in graph.graph.node if node.name in inner]
     assert inner
-    assert not any(_is_of(weight, ends) for weight in products)
+    for node in graph.graph.node:
+        if node.op_type in ("Gemm", "MatMul") and node.input[1] in constants:
+            value = constants.get_value(node.input[1])
+            is_inner = _is_of(value, weights.values()) and not _is_of(value, ends)
+            assert is_inner == (node.name in inner), node.name
 
 
 def _is_of(constant: np.ndarray, weights: Iterable[np.ndarray]) -> bool:
@@ -83,23 +66,15 @@ def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, netwo
     assert 1e-7 < float(apart.mean()) < 1e-3
 
 
-def one_product(weight: np.ndarray, rows: int, bias: np.ndarray | None = None) -> onnx.ModelProto:
-    """A graph of one layer: y = x @ weight.T + bias, x (rows, inputs)."""
-    outputs, inputs = weight.shape
-    stored = {"model.inner.weight": weight} | ({} if bias is None else {"model.inner.bias": bias})
+def one_product(weight: np.ndarray, bias: np.ndarray) -> onnx.ModelProto:
+    """A graph of one layer: y = x @ weight.T + bias, x (1, inputs)."""
+    stored = {"model.inner.weight": weight, "model.inner.bias": bias}
     node = onnx.helper.make_node("Gemm", ["x", *stored], ["y"], "product", transB=1)
-    ends = [
-        onnx.helper.make_tensor_value_info(*end)
-        for end in (("x", 1, [rows, inputs]), ("y", 1, [rows, outputs]))
-    ]
-    tensors = [numpy_helper.from_array(value, name) for name, value in stored.items()]
-    graph = onnx.helper.make_graph([node], "one", ends[:1], ends[1:], tensors)
+    value = onnx.helper.make_tensor_value_info
+    ends = [value(name, 1, [1, size]) for name, size in zip("yx", weight.shape, strict=True)]
+    tensors = [numpy_helper.from_array(array, name) for name, array in stored.items()]
+    graph = onnx.helper.make_graph([node], "one", ends[1:], ends[:1], tensors)
     return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=10)
-
-
-def restored(codes: np.ndarray, scales: np.ndarray, inputs: int) -> np.ndarray:
-    whole = (codes.astype(float) - ZERO) * scales[..., None]
-    return whole.reshape(len(codes), -1)[:, :inputs]
 
 
 def test_a_product_in_blocks_is_that_of_the_rounded_weight():
@@ -107,18 +82,30 @@ def test_a_product_in_blocks_is_that_of_the_rounded_weight():
     rng = np.random.default_rng(0)
     weight, bias = rng.standard_normal((24, 70)).astype(np.float32), np.ones(24, np.float32)
     values = rng.standard_normal((1, 70)).astype(np.float32)
-    graph = convert_to_int8_blocks(one_product(weight, 1, bias), ["product"])
+    graph = lower_precision.convert_to_int8_blocks(one_product(weight, bias), ["product"])
     made = InferenceSession(graph.SerializeToString()).run(None, {"x": values})[0]
-    rounded = restored(*quantise_in_blocks(values), 70) @ restored(*quantise_in_blocks(weight), 70).T + bias
-    np.testing.assert_allclose(made, rounded, atol=2e-3)
+
+    def rounded(matrix: np.ndarray) -> np.ndarray:
+        codes, scales = quantise_in_blocks(matrix)
+        whole = (codes.astype(float) - lower_precision.ZERO) * scales[..., None]
+        return whole.reshape(len(codes), -1)[:, :70]
+
+    np.testing.assert_allclose(made, rounded(values) @ rounded(weight).T + bias, atol=2e-3)
     assert np.abs(made - (values @ weight.T + bias)).max() > 2e-3
 
 
-@pytest.mark.parametrize("cell", ["gru"])
-def test_only_cells_are_in_blocks_and_the_motion_is_near(tmp_path: Path, cell: str):
-    stream = make_streaming_graph(tiny.recurrent_poser(Heading(), cell=cell, width=40))
-    exact, path = tmp_path / "exact.onnx", tmp_path / "blocks.onnx"
-    export(stream, exact, "0" * 16)
+@pytest.mark.parametrize("precision", ["int8", "fp16"])
+def test_a_network_without_inner_layers_is_refused(tmp_path: Path, precision: str):
+    path, stream = tmp_path / "step.onnx", SimpleNamespace(float32_modules=("inner",))
+    onnx.save(one_product(np.eye(3, dtype=np.float32), np.ones(3, np.float32)), path)
+    with pytest.raises(InputError, match=r"export\.precision"):
+        write_lower_precision(precision, path, tmp_path / "lower.onnx", stream, [CLIP])
+    assert {file.name for file in tmp_path.iterdir()} == {"step.onnx"}
+
+
+def test_only_cells_are_in_blocks_and_the_motion_is_near(step_files, tmp_path: Path):
+    exact, path = step_files("recurrent_poser"), tmp_path / "blocks.onnx"
+    stream = make_streaming_graph(exported.NETWORKS["recurrent_poser"]())
     write_lower_precision("int8_blocks", exact, path, stream, [])
     before, after = (Counter(node.op_type for node in onnx.load(file).graph.node) for file in (exact, path))
     graph = onnx.load(path).graph
@@ -134,12 +121,8 @@ def test_only_cells_are_in_blocks_and_the_motion_is_near(tmp_path: Path, cell: s
     assert 1e-6 < float(apart.abs().mean()) < 0.005
 
 
-# Cost
-
-
 @pytest.fixture(scope="module")
 def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
-    """The first tiny network's stream in float32 and in fp16."""
     exact, half = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "half.onnx"
     write_lower_precision("fp16", exact, half, make_streaming_graph(exported.NETWORKS["mem_mlp"]()), [])
     return exact, half
@@ -148,19 +131,22 @@ def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
 def test_lower_precision_replaces_float32_only_if_it_is_as_good(pair, step_files):
     normalizer = exported.NETWORKS["mem_mlp"]().normalizer
     exact, half = pair
-    cost = compare_accuracy(exact, half, "fp16", normalizer, CLIPS)
+    cost = lower_precision.compare_accuracy(exact, half, "fp16", normalizer, CLIPS)
     growth = {name: cost["fp16"][name] / cost["fp32"][name] - 1 for name in cost["fp32"]}
     assert cost["growth"] == pytest.approx(max(growth["MPJPE"], growth["position MPJPE"]))
     assert cost["jitter_growth"] == pytest.approx(growth["Jitter"])
     assert cost["default"] == (cost["growth"] <= 0.01 and cost["jitter_growth"] <= 0.1)
-    other = step_files("rotation_only")  # of two networks only the better one may replace the other
-    both = [compare_accuracy(*files, "fp16", normalizer, CLIPS) for files in ((exact, other), (other, exact))]
+    other = step_files("lstm")  # of two networks only the better one may replace the other
+    both = [
+        lower_precision.compare_accuracy(*files, "fp16", normalizer, CLIPS)
+        for files in ((exact, other), (other, exact))
+    ]
     assert sorted(cost["default"] for cost in both) == [False, True]
 
 
 def test_accuracy_is_that_of_the_evaluation(pair):
     model = exported.NETWORKS["mem_mlp"]()
-    found = measure_accuracy(pair[0], model.normalizer, CLIPS)
+    found = lower_precision.measure_accuracy(pair[0], model.normalizer, CLIPS)
     rows = []
     for motion, clip in zip(evaluation.predict_stream(model, CLIPS), CLIPS, strict=True):
         apart = (motion[:, 132:] - clip[:, 54 + 132 :]).unflatten(-1, (22, 3))  # positions, metres

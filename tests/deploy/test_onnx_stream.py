@@ -1,7 +1,5 @@
 """Exported steps in ONNX Runtime: their states, and files that are not such steps."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 import pytest

@@ -1,7 +1,6 @@
 """The stage that evaluates, and the broken network that it refuses."""
 
 import math
-from functools import partial
 
 import pytest
 import tiny
@@ -15,11 +14,6 @@ from memmlp.motion.network_coordinates import Heading
 
 STREAM = Evaluation(("stream",), batch=4, ik=NoIK(), seed=0)
 TEST = tiny.frames((14, 11))
-
-
-RECURRENT = {
-    name: partial(tiny.recurrent_poser, Heading(), output=name) for name in ["local", "global", "reaching"]
-}
 
 
 def test_a_rotation_of_zeros_or_parallel_columns_is_no_rotation():

@@ -101,9 +101,8 @@ def test_a_frame_is_solved_alike_alone_in_a_batch_and_in_chunks():
 def test_evaluation_reports_a_third_branch_with_the_rotation_branchs_metrics():
     model, split = tiny.model(), tiny.frames((30, 20))
     for mode in ("window", "stream"):
-        results, plain = (
-            Evaluation([mode], 8, ik, 0).report(model, split, mode) for ik in (LBFGS(5), NoIK())
-        )
+        solvers = LBFGS(5), NoIK()
+        results, plain = (Evaluation([mode], 8, ik, 0).report(model, split, mode) for ik in solvers)
         assert set(results["mean"]) == {"rotation", "position", "combined"}
         assert set(plain["mean"]) == {"rotation", "position"}
         assert results["mean"]["combined"].keys() == results["mean"]["rotation"].keys()

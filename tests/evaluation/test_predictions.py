@@ -1,7 +1,5 @@
 """A network's predictions as clips: the same joints as those that are measured."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +24,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.clip import Clip
 from memmlp.motion.exporting import plan_export
 from memmlp.motion.formats.npz import read_clip, write_clip
-from memmlp.motion.geometry import axis_angle_to_matrix, compute_motion_frames, forward_kinematics
+from memmlp.motion.geometry import compute_clip_kinematics, compute_motion_frames
 
 NETWORK = model()
 BODY = REST.numpy()
@@ -50,8 +48,7 @@ def frames(clip: Clip) -> torch.Tensor:
 
 
 def joints(clip: Clip) -> np.ndarray:
-    local = axis_angle_to_matrix(torch.tensor(clip.poses))
-    return forward_kinematics(local, torch.tensor(clip.trans + BODY[0]), REST)[1].numpy()
+    return compute_clip_kinematics(clip, BODY)[1]
 
 
 @pytest.mark.parametrize("mode", ["stream", "window"])
@@ -110,11 +107,8 @@ def test_a_folder_is_predicted_as_its_clips_are(tmp_path: Path):
         write_clip(tmp_path / "in" / f"{name}.npz", clip)
     (tmp_path / "in" / "bad.npz").write_bytes(b"none")
     report = predictor().export(plan_export(tmp_path / "in", tmp_path / "out", "npz"))
-    assert [path.relative_to(tmp_path / "out").as_posix() for path in report.written] == [
-        "a.npz",
-        "b/c.npz",
-        "d.npz",
-    ]
+    written = [path.relative_to(tmp_path / "out").as_posix() for path in report.written]
+    assert written == ["a.npz", "b/c.npz", "d.npz"]
     assert [each.file for each in report.skipped] == ["bad.npz", "short.npz"]
     assert report.skipped[1].reason.startswith("has one frame at 60 Hz")
     for name, stride in (("a", 1), ("b/c", 2), ("d", 1)):
@@ -131,11 +125,10 @@ def test_a_folder_is_predicted_as_its_clips_are(tmp_path: Path):
 @pytest.mark.slow
 def test_an_offline_network_has_no_stream_to_predict_or_to_draw(tmp_path: Path):
     offline = baseline("bodiffusion", offline=True, sampling_steps=2, depth=1)
-    settings = {"modes": ["window"], "batch": 2, "ik": NoIK(), "seed": 0}
     with pytest.raises(InputError, match="mode=stream"):
         predict_clip(offline, frames(source(30)), "stream")
     with pytest.raises(InputError, match="mode=stream"):
-        ClipPredictor(offline, "stream", "rotation", Evaluation(**settings))
+        ClipPredictor(offline, "stream", "rotation", Evaluation(["window"], 2, NoIK(), 0))
     assert predict_clip(offline, frames(source(30)), "window")["predicted_positions"].shape == (29, 22, 3)
     truth, predicted = evaluation.predict_first_clip(offline, tiny_frames())
     assert truth.shape == predicted.shape

@@ -1,11 +1,9 @@
-"""A made-up person as ASF/AMC text, and such files posed by plain NumPy, beside the package."""
-
-from __future__ import annotations
+"""A made-up person as ASF/AMC text, and its takes posed by SciPy, beside the package."""
 
 from pathlib import Path
 
 import numpy as np
-from plain_kinematics import about
+from scipy.spatial.transform import Rotation
 
 # Bone, parent, direction and length in the zero pose, angles of its own axes, values in a frame.
 SKELETON = """
@@ -50,21 +48,15 @@ def asf_text() -> str:
     lines = ["# made f\xfcr tests", ":version 1.10", ":name VICON", ":units", "  mass 1.0", "  length 0.45"]
     lines += ["  angle deg", ":documentation", "   a person", ":root", "   order TX TY TZ RX RY RZ"]
     lines += ["   axis XYZ", "   position 0 0 0  ", "   orientation 0 0 0 ", ":bonedata"]
-    for number, (name, rest) in enumerate(BONES.items(), start=1):
-        lines += [
-            "  begin",
-            f"     id {number}",
-            f"     name {name}",
-            f"     direction {' '.join(rest[1:4])}",
-        ]
-        lines += [f"     length {rest[4]}", f"     axis {' '.join(rest[5:8])}  XYZ"]
-        if dofs := rest[8:]:
+    children: dict[str, list[str]] = {}
+    for number, (name, (parent, x, y, z, length, *angles)) in enumerate(BONES.items(), start=1):
+        children.setdefault(parent, []).append(name)
+        lines += ["  begin", f"     id {number}", f"     name {name}", f"     direction {x} {y} {z}"]
+        lines += [f"     length {length}", f"     axis {' '.join(angles[:3])}  XYZ"]
+        if dofs := angles[3:]:
             limits = ["    limits (-160.0 20.0)", *["           (-70.0 70.0)"] * (len(dofs) - 1)]
             lines += [f"    dof {' '.join(dofs)}", *limits]
         lines.append("  end")
-    children: dict[str, list[str]] = {}
-    for name, (parent, *_) in BONES.items():
-        children.setdefault(parent, []).append(name)
     lines += [":hierarchy", "  begin", *(f"    {p} {' '.join(c)}" for p, c in children.items()), "  end"]
     return "\n".join(lines) + "\n"
 
@@ -80,16 +72,16 @@ def amc_text(values: np.ndarray, first: int = 1) -> str:
     return "\n".join(lines) + "\n"
 
 
+COLUMNS = [(name, dof) for name, dofs in DOFS.items() for dof in dofs]
+"""Of values (N, 62)."""
+
+
 def movement(frames: int, size: float = 20.0) -> np.ndarray:
     """Values (N, 62) of a person who stands, with all joints swinging: knees and elbows bend one way."""
     random = np.random.default_rng(1)
-    count = sum(map(len, DOFS.values()))
-    phase, speed = random.uniform(0, 6, count), random.uniform(1, 3, count)
+    phase, speed = random.uniform(0, 6, len(COLUMNS)), random.uniform(1, 3, len(COLUMNS))
     values = size * np.sin(phase + np.outer(np.arange(frames) / 20, speed))
-    columns = [name for name, dofs in DOFS.items() for _ in dofs]
-    for column, name in enumerate(columns):
-        if name in ("ltibia", "rtibia", "lradius", "rradius"):
-            values[:, column] += size
+    values[:, [name in ("ltibia", "rtibia", "lradius", "rradius") for name, _ in COLUMNS]] += size
     values[:, :3] = [0.3, 17.0, 0.8] + 0.02 * values[:, :3]
     return values
 
@@ -103,45 +95,21 @@ def write_take(folder: Path, values: np.ndarray, first: int = 1) -> Path:
     return take
 
 
-def plain_positions(asf: Path, amc: Path) -> dict[str, np.ndarray]:
-    """Pose a take: the positions (N, 3), metres, of each bone's start, `BONE.end` being its end."""
-    words = [line.split("#")[0].split() for line in asf.read_text("latin-1").splitlines()]
-    words = [line for line in words if line]
-    bones, bone, parents, inside = {}, {}, {}, False
-    for line in words:
-        inside = line[0] == ":hierarchy" or (inside and line[0][0] != ":")
-        if inside and line[0] not in ("begin", "end"):
-            parents |= dict.fromkeys(line[1:], line[0])
-        elif line[0] == "begin":
-            bone = {}
-        elif line[0] == "name":
-            bones[line[1]] = bone
-        bone[line[0]] = line[1:]
-    scale = 2.54 / 0.45 / 100
-    frames: list[dict[str, list[float]]] = []
-    for line in amc.read_text("latin-1").splitlines():
-        own = line.split()
-        if not own or own[0][0] in "#:":
-            continue
-        if len(own) == 1:
-            frames.append({})
-        else:
-            frames[-1][own[0]] = [float(number) for number in own[1:]]
+def plain_positions(values: np.ndarray) -> dict[str, np.ndarray]:
+    """The positions (N, 3), metres, of each bone's start, `BONE.end` being its end; by SciPy."""
 
     def turn(angles: np.ndarray) -> np.ndarray:
-        x, y, z = (about(axis, np.radians(angles[:, axis])) for axis in range(3))
-        return z @ y @ x
+        return Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
 
-    root = np.array([frame["root"] for frame in frames])
-    starts, rotations = {"root": scale * root[:, :3]}, {"root": turn(root[:, 3:])}
+    scale = 2.54 / 0.45 / 100
+    starts, rotations = {"root": scale * values[:, :3]}, {"root": turn(values[:, 3:6])}
     ends = {"root": starts["root"]}
-    for name, parent in parents.items():
-        own = bones[name]
-        angles = np.zeros((len(frames), 3))
-        for column, dof in enumerate(own.get("dof", [])):
-            angles[:, ANGLES.index(dof)] = [frame[name][column] for frame in frames]
-        axes = turn(np.array([own["axis"][:3]], float))[0]
-        rotations[name] = rotations[parent] @ axes @ turn(angles) @ axes.T
-        bone_vector = scale * float(own["length"][0]) * np.array(own["direction"], float)
-        starts[name], ends[name] = ends[parent], ends[parent] + rotations[name] @ bone_vector
+    for name, (parent, *numbers) in BONES.items():
+        direction, length, axis = np.split(np.array(numbers[:7], float), [3, 4])
+        angles = np.zeros((len(values), 3))
+        for column, (bone, dof) in enumerate(COLUMNS):
+            if bone == name:
+                angles[:, ANGLES.index(dof)] = values[:, column]
+        rotations[name] = rotations[parent] @ turn(axis) @ turn(angles) @ turn(axis).T
+        starts[name], ends[name] = ends[parent], ends[parent] + rotations[name] @ (scale * length * direction)
     return starts | {f"{name}.end": end for name, end in ends.items()}

@@ -1,7 +1,5 @@
 """Small BVH files of two shipped skeletons, and their expected refusals."""
 
-from __future__ import annotations
-
 import itertools
 import warnings
 from collections.abc import Iterator
@@ -75,7 +73,6 @@ class Sample:
         return end.join(lines) + end
 
     def hierarchy(self) -> Bvh:
-        """The file as a reader returns it."""
         nodes = (*self.names, *(self.names[joint] + END for joint, _ in self.ends))
         parents = (*self.parents, *(joint for joint, _ in self.ends))
         offsets = np.array([*self.offsets, *(offset for _, offset in self.ends)])
@@ -156,19 +153,22 @@ def refuse(start: Path | str, *said: str) -> Iterator[None]:
 def own_tree(chosen: SkeletonMap) -> Sample:
     """Make a skeleton of just the nodes that a map names, somewhat unlike the built-in body, in a T-pose."""
     order = [joint for joint in depth_first() if JOINTS[joint] in chosen.joints]
-    at = (REST * [1.1, 0.9, 1.0] + [0.0, 0.0, 0.01]) @ file_axes(chosen).T / (chosen.unit or 0.01)
+    axes = Z_UP if chosen.up == "z" else np.eye(3)
+    at = (REST * [1.1, 0.9, 1.0] + [0.0, 0.0, 0.01]) @ axes.T / (chosen.unit or 0.01)
     sample = Sample([], [], [], [], [], np.empty((0, 0)))
     for joint in order:
-        parent = next((above for above in ancestors(joint) if above in order), None)
-        above = None if parent is None else chosen.joints[JOINTS[parent]]
-        offset = at[joint] - at[parent or 0]
-        if chosen.joints[JOINTS[joint]].endswith(END):
-            sample.ends.append((sample.names.index(str(above)), offset.tolist()))
-            continue
-        sample.names.append(chosen.joints[JOINTS[joint]])
-        sample.parents.append(-1 if above is None else sample.names.index(above))
-        sample.offsets.append(offset.tolist())
-        sample.channels.append((*(POSITIONS if above is None else ()), *ZXY))
+        node, parent = chosen.joints[JOINTS[joint]], PARENTS[joint]
+        while parent >= 0 and parent not in order:
+            parent = PARENTS[parent]
+        above = sample.names.index(chosen.joints[JOINTS[parent]]) if parent >= 0 else -1
+        offset = (at[joint] - at[max(parent, 0)]).tolist()
+        if node.endswith(END):
+            sample.ends.append((above, offset))
+        else:
+            sample.names.append(node)
+            sample.parents.append(above)
+            sample.offsets.append(offset)
+            sample.channels.append((*(POSITIONS if parent < 0 else ()), *ZXY))
     return sample
 
 
@@ -176,18 +176,6 @@ def depth_first(joint: int = 0) -> list[int]:
     """The body's joints in the order of a file."""
     below = [depth_first(child) for child, parent in enumerate(PARENTS) if parent == joint]
     return [joint, *itertools.chain(*below)]
-
-
-def ancestors(joint: int) -> list[int]:
-    line = [PARENTS[joint]]
-    while line[-1] > 0:
-        line.append(PARENTS[line[-1]])
-    return [above for above in line if above >= 0]
-
-
-def file_axes(chosen: SkeletonMap) -> np.ndarray:
-    """The rotation from Y-up axes to those of a map's files."""
-    return Z_UP if chosen.up == "z" else np.eye(3)
 
 
 def performed(
@@ -209,63 +197,46 @@ def performed(
             motion is the same.
     """
     sample = sample or own_tree(chosen)
-    axes = file_axes(chosen)
-    body = body_rotations(clip)
+    axes, body = Z_UP if chosen.up == "z" else np.eye(3), body_rotations(clip)
     world = axes @ Z_UP.T
-    corrections = np.tile(np.eye(3), (len(JOINTS), 1, 1)) if corrections is None else corrections
-    turned = np.empty((len(clip) + 1, len(sample.names), 3, 3))
-    turned[0] = np.eye(3)
-    counterparts = {
-        node: joint for joint, node in reversed(list(zip(JOINTS, joints_nodes(chosen), strict=True)))
-    }
+    if corrections is not None:
+        body = body @ corrections.swapaxes(-1, -2)
+    turned = np.tile(np.eye(3), (len(clip) + 1, len(sample.names), 1, 1))
+    counterparts = {node: JOINTS.index(joint) for joint, node in chosen.joints.items()}
     for index, (name, parent) in enumerate(zip(sample.names, sample.parents, strict=True)):
-        joint = counterparts.get(name)
-        if joint is None:
-            turned[1:, index] = turned[1:, parent]
+        if name in counterparts:
+            turned[1:, index] = world @ body[:, counterparts[name]] @ axes.T
         else:
-            own = body[:, JOINTS.index(joint)] @ corrections[JOINTS.index(joint)].T
-            turned[1:, index] = world @ own @ axes.T
-    unit = chosen.unit or 0.01
-    scale = unit * leg(chosen, sample) / np.linalg.norm(REST[[4, 7]] - REST[[1, 4]], axis=-1).sum()
-    root = scale * (clip.trans + REST[0]) @ world.T / unit
-    values = [np.concatenate([np.zeros((1, 3)), root])]
-    turns = np.tile(np.eye(3), (len(sample.names), 1, 1)) if turns is None else turns
+            turned[1:, index] = turned[1:, parent]
     offsets = np.array(sample.offsets)
+    shin, foot = (offsets[sample.names.index(chosen.joints[end])] for end in ("left_knee", "left_ankle"))
+    leg = np.linalg.norm(shin) + np.linalg.norm(foot)
+    scale = leg / np.linalg.norm(REST[[4, 7]] - REST[[1, 4]], axis=-1).sum()
+    values = [np.concatenate([np.zeros((1, 3)), scale * (clip.trans + REST[0]) @ world.T])]
+    turns = np.tile(np.eye(3), (len(sample.names), 1, 1)) if turns is None else turns
     for joint, parent in enumerate(sample.parents):
-        above, turn = (
-            (turned[:, parent] @ turns[parent], turns[parent])
-            if parent >= 0
-            else (np.eye(3)[None], np.eye(3))
-        )
-        local = np.swapaxes(above, 1, 2) @ turned[:, joint] @ turns[joint]
-        order = "".join(channel[0] for channel in sample.channels[joint][-3:])
+        turn = turns[parent] if parent >= 0 else np.eye(3)
+        above = turned[:, parent] @ turn if parent >= 0 else np.eye(3)[None]
+        local = above.swapaxes(1, 2) @ turned[:, joint] @ turns[joint]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # gimbal lock: the rotation is right
-            values.append(Rotation.from_matrix(local).as_euler(order, degrees=True))
+            values.append(Rotation.from_matrix(local).as_euler(rotation_order(sample, joint), degrees=True))
         offsets[joint] = turn.T @ offsets[joint]
     ends = [(joint, (turns[joint].T @ offset).tolist()) for joint, offset in sample.ends]
     table = np.concatenate(values, 1)[0 if chosen.calibration_frame else 1 :]
     return replace(sample, offsets=offsets.tolist(), ends=ends, values=table)
 
 
-def leg(chosen: SkeletonMap, sample: Sample) -> float:
-    """The length from hip to ankle, in the file's unit."""
-    offsets = dict(zip(sample.names, sample.offsets, strict=True))
-    return float(sum(np.linalg.norm(offsets[chosen.joints[end]]) for end in ("left_knee", "left_ankle")))
-
-
-def joints_nodes(chosen: SkeletonMap) -> list[str]:
-    """The node of each body joint; "" where it has none."""
-    return [chosen.joints.get(joint, "") for joint in JOINTS]
+def rotation_order(sample: Sample, joint: int) -> str:
+    return "".join(channel[0] for channel in sample.channels[joint][-3:])
 
 
 def rest_turns(chosen: SkeletonMap, sample: Sample) -> np.ndarray:
     """The joints' rotations (joints, 3, 3) in a map's `rest`: turned by these, that pose is a T-pose."""
-    assert chosen.rest is not None
     turns = np.empty((len(sample.names), 3, 3))
     for joint, (name, parent) in enumerate(zip(sample.names, sample.parents, strict=True)):
-        order = "".join(channel[0] for channel in sample.channels[joint][-3:])
-        own = Rotation.from_euler(order, chosen.rest.get(name, [0, 0, 0]), degrees=True).as_matrix()
+        angles = (chosen.rest or {}).get(name, [0, 0, 0])
+        own = Rotation.from_euler(rotation_order(sample, joint), angles, degrees=True).as_matrix()
         turns[joint] = turns[parent] @ own if parent >= 0 else own
     return turns
 
@@ -275,7 +246,6 @@ def random_turns(sample: Sample, seed: int) -> np.ndarray:
 
 
 def body_rotations(clip: Clip) -> np.ndarray:
-    """Return global rotations (N, 22, 3, 3)."""
     local = Rotation.from_rotvec(clip.poses.reshape(-1, 3)).as_matrix().reshape(len(clip), -1, 3, 3)
     for joint, parent in enumerate(PARENTS[1:], start=1):
         local[:, joint] = local[:, parent] @ local[:, joint]

@@ -1,21 +1,18 @@
 """A .glb file by an independent reading: JSON, accessors, and kinematics of the nodes in plain NumPy."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 COUNTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 TYPES = {5121: "u1", 5123: "<u2", 5126: "<f4"}
 
 
 class Glb:
-    """A .glb file as the specification says it is."""
-
     def __init__(self, path: Path):
         data = path.read_bytes()
         magic, version, length = struct.unpack_from("<4sII", data)
@@ -63,12 +60,14 @@ class Glb:
             node = self.json["nodes"][index]
             shift = np.array(node.get("translation", (0, 0, 0)), float)
             turn = np.array(node.get("rotation", (0, 0, 0, 1)), float)
-            if (node["name"], "translation") in channels:
-                shift = channels[node["name"], "translation"][1][frame].astype(float)
-            if (node["name"], "rotation") in channels:
-                turn = channels[node["name"], "rotation"][1][frame].astype(float)
+            shift, turn = (
+                channels[node["name"], path][1][frame].astype(float)
+                if (node["name"], path) in channels
+                else own
+                for path, own in (("translation", shift), ("rotation", turn))
+            )
             local = np.eye(4)
-            local[:3, :3], local[:3, 3] = of_quaternion(turn), shift
+            local[:3, :3], local[:3, 3] = Rotation.from_quat(turn).as_matrix(), shift
             found[node["name"]] = above @ local
             for child in node.get("children", ()):
                 visit(child, found[node["name"]])
@@ -78,7 +77,6 @@ class Glb:
         return found
 
     def vertices(self, frame: int | None) -> np.ndarray:
-        """The skinned mesh's vertices (V, 3)."""
         skin, attributes = self.json["skins"][0], self.json["meshes"][0]["primitives"][0]["attributes"]
         inverse = self.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)  # by columns
         world = self.matrices(frame)
@@ -89,15 +87,3 @@ class Glb:
         np.testing.assert_array_equal(weights.sum(1), 1)
         blended = (matrices[self.array(attributes["JOINTS_0"])] * weights[..., None, None]).sum(1)
         return np.einsum("vij,vj->vi", blended, points)[:, :3]
-
-
-def of_quaternion(xyzw: np.ndarray) -> np.ndarray:
-    """The rotation matrix (3, 3) of a unit quaternion."""
-    x, y, z, w = xyzw
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

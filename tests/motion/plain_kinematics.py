@@ -1,10 +1,9 @@
 """BVH text posed by plain NumPy, beside the package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def bvh_positions(path: Path) -> dict[str, np.ndarray]:
@@ -33,11 +32,13 @@ def bvh_positions(path: Path) -> dict[str, np.ndarray]:
                 channels = words[index + 6 : index + 6 + int(words[index + 5])]
             local = np.tile(np.eye(3), (len(rows), 1, 1))
             for channel in channels:
-                axis = "XYZ".index(channel[0])
                 if channel.endswith("position"):
-                    shift[:, axis] = rows[:, column]
+                    shift[:, "XYZ".index(channel[0])] = rows[:, column]
                 else:
-                    local = local @ about(axis, np.radians(rows[:, column]))
+                    local = (
+                        local
+                        @ Rotation.from_euler(channel[0].lower(), rows[:, [column]], degrees=True).as_matrix()
+                    )
                 column += 1
             if len(open_joints) == 1:
                 positions[name], rotations[name] = shift, local
@@ -46,14 +47,3 @@ def bvh_positions(path: Path) -> dict[str, np.ndarray]:
                 positions[name] = positions[above] + np.einsum("nij,nj->ni", rotations[above], shift)
                 rotations[name] = rotations[above] @ local
     return positions
-
-
-def about(axis: int, angles: np.ndarray) -> np.ndarray:
-    """Rotations (N, 3, 3) about a coordinate axis."""
-    result = np.zeros((len(angles), 3, 3))
-    result[:, axis, axis] = 1
-    a, b = (axis + 1) % 3, (axis + 2) % 3
-    result[:, a, a] = result[:, b, b] = np.cos(angles)
-    result[:, b, a] = np.sin(angles)
-    result[:, a, b] = -np.sin(angles)
-    return result

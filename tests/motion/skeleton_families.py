@@ -1,7 +1,5 @@
 """Skeletons of every shipped map, for Mixamo with nodes that its map leaves out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from bvh_samples import TREES, ZXY, Sample, own_tree, performed, random_turns, tree
@@ -27,7 +25,6 @@ MORE = {
 
 
 def family(name: str) -> Sample:
-    """Make the skeleton of a map, in a T-pose."""
     sample = tree(name) if name in TREES else own_tree(load_skeleton(name))
     for entry in filter(None, MORE.get(name, "").split(";")):
         node, *rest = entry.split()
@@ -50,14 +47,11 @@ def in_order(sample: Sample) -> Sample:
         return [joint, *(node for child in children for node in below(child))]
 
     order = below(0)
-    return replace(
-        sample,
-        names=[sample.names[old] for old in order],
-        parents=[order.index(sample.parents[old]) if old else -1 for old in order],
-        offsets=[sample.offsets[old] for old in order],
-        ends=[(order.index(joint), offset) for joint, offset in sample.ends],
-        channels=[sample.channels[old] for old in order],
-    )
+    parts = ([part[old] for old in order] for part in (sample.names, sample.offsets, sample.channels))
+    names, offsets, channels = parts
+    parents = [order.index(sample.parents[old]) if old else -1 for old in order]
+    ends = [(order.index(joint), offset) for joint, offset in sample.ends]
+    return replace(sample, names=names, parents=parents, offsets=offsets, ends=ends, channels=channels)
 
 
 def walking(name: str, turned: bool = False, seconds: float = 2.0) -> Sample:
@@ -69,11 +63,9 @@ def walking(name: str, turned: bool = False, seconds: float = 2.0) -> Sample:
 
 
 def renamed(bvh: Bvh, names: dict[str, str]) -> Bvh:
-    """Return a file with other names, given for its joints."""
     new = [names[name.removesuffix(END)] + (END if name.endswith(END) else "") for name in bvh.nodes]
     return replace(bvh, nodes=tuple(new))
 
 
 def joints(bvh: Bvh) -> tuple[str, ...]:
-    """Return the names of a file's joints, without its end sites."""
     return bvh.nodes[: len(bvh.channels)]

@@ -1,7 +1,5 @@
 """The body that clips were imported onto, compared with the one that uses them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rotations against SciPy, gradients at awkward angles, forward kinematics against a plain recursion."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -39,20 +37,15 @@ def test_gradients(angle):
     )
 
 
-def test_sixd_is_two_columns_and_gram_schmidt_of_anything():
-    matrix = torch.tensor(Rotation.random(20, rng=0).as_matrix())
-    sixd = geometry.matrix_to_sixd(matrix)
-    assert torch.equal(sixd[:, :3], matrix[:, :, 0])
-    assert torch.equal(sixd[:, 3:], matrix[:, :, 1])
-    torch.testing.assert_close(geometry.sixd_to_matrix(sixd), matrix)
-    stretched = torch.cat([1.7 * sixd[:, :3], 0.4 * sixd[:, 3:] + 0.3 * sixd[:, :3]], -1)
-    torch.testing.assert_close(geometry.sixd_to_matrix(stretched), matrix)
-
-
-def test_sixd_of_exactly_three_rows():
+@pytest.mark.parametrize("count", [20, 3])
+def test_sixd_is_two_columns_and_gram_schmidt_of_anything(count):
     """torch.cross without `dim` goes wrong on 3 x 3."""
-    matrix = torch.tensor(Rotation.random(3, rng=1).as_matrix())
-    torch.testing.assert_close(geometry.sixd_to_matrix(geometry.matrix_to_sixd(matrix)), matrix)
+    matrix = torch.tensor(Rotation.random(count, rng=0).as_matrix())
+    sixd = geometry.matrix_to_sixd(matrix)
+    assert torch.equal(sixd, torch.cat([matrix[:, :, 0], matrix[:, :, 1]], -1))
+    stretched = torch.cat([1.7 * sixd[:, :3], 0.4 * sixd[:, 3:] + 0.3 * sixd[:, :3]], -1)
+    for columns in (sixd, stretched):
+        torch.testing.assert_close(geometry.sixd_to_matrix(columns), matrix)
 
 
 def test_geodesic_angle():
@@ -83,9 +76,8 @@ def test_forward_kinematics_is_a_recursion():
 
 def test_the_built_in_body_is_a_person():
     rest = dict(zip(JOINTS, make_builtin_rest_joints(), strict=True))
-    assert (
-        rest["head"][1] > rest["neck"][1] > rest["pelvis"][1] > rest["left_knee"][1] > rest["left_ankle"][1]
-    )
+    heights = [rest[name][1] for name in ("head", "neck", "pelvis", "left_knee", "left_ankle")]
+    assert heights == sorted(heights, reverse=True)
     for name in JOINTS:
         if name.startswith("left_"):
             assert rest[name][0] > 0
@@ -93,22 +85,17 @@ def test_the_built_in_body_is_a_person():
     assert 1.5 < rest["head"][1] - rest["left_foot"][1] < 1.7
 
 
-# The joints of a body that moves as a clip does
-
-
 def test_a_body_that_is_turned_about_its_pelvis():
     """By a right angle about X in its second frame; the pelvis alone keeps its offset unturned."""
-    rest = make_builtin_rest_joints() + np.array([0.1, 0.2, 0.3])
-    poses = np.zeros((2, 22, 3))
+    rest, poses = make_builtin_rest_joints() + np.array([0.1, 0.2, 0.3]), np.zeros((2, 22, 3))
     poses[1, 0, 0] = np.pi / 2
     trans = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
     rotations, positions = compute_clip_kinematics(Clip("turned", poses, trans, 60.0), rest)
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    np.testing.assert_allclose(
-        rotations, np.stack([np.tile(each, (22, 1, 1)) for each in (np.eye(3), turn)]), atol=1e-7
-    )
-    np.testing.assert_allclose(positions[0], rest, atol=1e-7)
-    np.testing.assert_allclose(positions[1], rest[0] + trans[1] + (rest - rest[0]) @ turn.T, atol=1e-7)
+    for frame, matrix in enumerate((np.eye(3), turn)):
+        np.testing.assert_allclose(rotations[frame], np.tile(matrix, (22, 1, 1)), atol=1e-7)
+        expected = rest[0] + trans[frame] + (rest - rest[0]) @ matrix.T
+        np.testing.assert_allclose(positions[frame], expected, atol=1e-7)
 
 
 def test_one_thread_and_then_as_many_as_before() -> None:

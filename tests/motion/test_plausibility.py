@@ -50,7 +50,7 @@ def faults(clip: Clip) -> str:
 
 def test_what_people_do_passes():
     for clip in map(motion, ACTIVITIES):
-        for sound in (clip, moved(clip, z=-2.5), moved(clip, z=8.0), moved(clip, 700.0, -300.0)):
+        for sound in (clip, moved(clip, z=-40.0), moved(clip, z=100.0), moved(clip, 700.0, -300.0)):
             assert explain_implausibility(sound) is None
             assert faults(sound) == ""
     single = replace(clip, poses=clip.poses[:1], trans=clip.trans[:1])
@@ -68,11 +68,7 @@ def test_lying_and_crawling_pass_and_are_reported(heading):
 
 def test_a_rate_at_which_hardly_anybody_records_is_reported():
     clip = motion("idling")
-    for fps, said in (
-        (12.0, "usual rates are 20 to 500 Hz"),
-        (1000.0, "usual rates are 20"),
-        (62.5, "60 Hz"),
-    ):
+    for fps, said in ((12.0, "20 to 500 Hz"), (1000.0, "20 to 500 Hz"), (62.5, "60 Hz")):
         odd = replace(clip, fps=fps)
         assert explain_implausibility(odd) is None
         assert f"the frame rate {fps:g} Hz" in faults(odd)
@@ -91,22 +87,17 @@ def test_jumps_cuts_and_a_frozen_translation_are_reported():
         assert "after frame 199" in faults(replace(clip, poses=poses, trans=trans))
         frozen[200:260] = frozen[200]
         assert "trans is constant for 59 successive frames" in faults(replace(clip, trans=frozen))
-        assert "trans is constant" not in faults(
-            replace(clip, trans=frozen, poses=clip.poses * 0 + clip.poses[0])
-        )
+        still = replace(clip, trans=frozen, poses=clip.poses * 0 + clip.poses[0])
+        assert "trans is constant" not in faults(still)
 
 
-def test_a_pose_that_is_held_throughout_is_reported():
+def test_held_poses_and_swapped_sides_are_reported():
     """T-poses for calibration, and files that have lost all rotations but the root's."""
     clip = motion("walking")
     for first in (1, 0):
         poses = np.concatenate([clip.poses[:, :first], np.repeat(clip.poses[:1, first:], len(clip), 0)], 1)
         assert explain_implausibility(replace(clip, poses=poses)) is None
         assert faults(replace(clip, poses=poses)).startswith("only the root turns")
-
-
-def test_left_and_right_swapped_is_reported():
-    """Elbows and knees then bend backwards; a true mirror image is a person's motion."""
     clip = motion("walking")
     poses = clip.poses[:, OTHER_SIDE]
     assert faults(replace(clip, poses=poses)).startswith("the elbows bend backwards")
@@ -122,22 +113,11 @@ def test_a_mirrored_axis_is_reported(signs, joints):
     assert faults(replace(clip, poses=poses)).startswith(f"the {joints} bend backwards")
 
 
-def test_a_floor_at_any_height_passes_where_feet_stand_on_it():
-    for z in (-40.0, 100.0):
-        clip = moved(motion("walking"), z=z)
-        assert explain_implausibility(clip) is None
-        assert faults(clip) == ""
-
-
-@pytest.mark.parametrize(
-    ("trans", "z"),
-    [
-        (lambda trans: trans * 0, "-0.9"),  # relative to the root
-        (lambda trans: trans * 3.281, "2.1"),  # feet
-        (lambda trans: trans[:, [0, 2, 1]] * [1, 1, -1], "-5.0"),  # Y up, the rotations Z up
-    ],
-    ids=["zeros", "feet", "Y up"],
-)
+@pytest.mark.parametrize(("trans", "z"), [
+    (lambda trans: trans * 0, "-0.9"),  # relative to the root
+    (lambda trans: trans * 3.281, "2.1"),  # feet
+    (lambda trans: trans[:, [0, 2, 1]] * [1, 1, -1], "-5.0"),  # Y up, the rotations Z up
+])  # fmt: skip
 def test_a_translation_that_does_not_fit_the_steps_is_reported(trans, z):
     clip = motion("walking")
     wrong = replace(clip, trans=trans(clip.trans))
@@ -154,15 +134,12 @@ def test_a_glitch_or_a_wound_up_root_passes():
     assert explain_implausibility(replace(clip, trans=trans, poses=poses)) is None
 
 
-def test_other_units_and_another_axis_are_refused():
+def test_people_in_other_units_or_with_another_axis_are_refused():
     clip = motion("walking")
     assert "degrees" in explain_implausibility(replace(clip, poses=np.degrees(clip.poses)))
     for scale in (39.37, 100.0, 1000.0):
         assert "not in metres" in explain_implausibility(replace(clip, trans=scale * clip.trans))
     assert "Y is up" in explain_implausibility(turned(clip, Y_UP))
-
-
-def test_someone_who_hardly_moves_in_centimetres_is_refused():
     clip = motion("idling")
     still = replace(clip, trans=clip.trans[0] + 0.05 * (clip.trans - clip.trans[0]))
     assert "at z = " in explain_implausibility(replace(still, trans=100 * still.trans))

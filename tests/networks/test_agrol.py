@@ -8,17 +8,13 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
 
 CLIP = tiny.clip(40)
-SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
 @torch.no_grad()
 def test_agrol_windows_see_nothing_of_other_windows():
     model, changed = tiny.baseline("agrol_mlp"), CLIP.clone()
     changed[:7] += 0.5
-    before, after = (
-        evaluation.predict_windows(model, [CLIP])[0],
-        evaluation.predict_windows(model, [changed])[0],
-    )
+    before, after = (evaluation.predict_windows(model, [clip])[0] for clip in (CLIP, changed))
     assert torch.equal(before[7:], after[7:])
     assert not torch.allclose(before[6], after[6])
 

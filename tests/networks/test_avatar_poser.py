@@ -7,7 +7,6 @@ import torch
 from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION
 
 CLIP = tiny.clip(40)
-SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
 @torch.no_grad()
@@ -20,24 +19,16 @@ def test_avatar_poser_reads_the_newest_frame_and_knows_no_order_of_the_others():
 
 @torch.no_grad()
 def test_tokens_are_an_independent_computation():
-    """Frame by frame, in NumPy: relative to the head, movement appended, every second frame added."""
+    """In NumPy: relative to the head, movement appended, every second frame added."""
     model, window = tiny.baseline("ego_poser", frames=8).double(), CLIP[None, :8, :SPARSE_DIM].double()
     seen = []
     model.encode = lambda h: (seen.append(h), torch.zeros(1, 132).double())[1]
     model.predict_rotations(window)
-    rows = []
-    for frame in window[0].numpy():
-        row = frame.copy()
-        for tracker in range(3):
-            at = SPARSE_POSITION.start + 3 * tracker
-            row[at : at + 2] -= frame[SPARSE_POSITION.start : SPARSE_POSITION.start + 2]
-        rows.append(row)
-    corners = [36, 37, 39, 40, 42, 43]
-    rows = np.array([np.concatenate([row, (row - rows[0])[corners]]) for row in rows])
+    rows, corners = window[0].numpy().copy(), [36, 37, 39, 40, 42, 43]  # x and y of each tracker
+    rows[:, corners] -= np.tile(rows[:, 36:38], 3)
+    rows = np.concatenate([rows, (rows - rows[0])[:, corners]], 1)
     weight, bias = (part.numpy() for part in (model.embedding.weight, model.embedding.bias))
-    pairs = zip(range(0, 8, 2), range(4, 8), strict=True)
-    expected = np.array([(rows[slow] + rows[fast]) @ weight.T + 2 * bias for slow, fast in pairs])
-    np.testing.assert_allclose(seen[0][0].numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(seen[0][0].numpy(), (rows[::2] + rows[4:]) @ weight.T + 2 * bias, atol=1e-12)
 
 
 @torch.no_grad()

@@ -1,5 +1,7 @@
 """BoDiffusion, part by part."""
 
+from functools import partial
+
 import pytest
 import tiny
 import torch
@@ -74,8 +76,6 @@ def test_offline_it_is_no_stream():
     assert not has_streaming_graph(model)
     with pytest.raises(InputError, match=r"model\.offline=true"):
         make_streaming_graph(model)
-    report = Evaluation(["window"], 4, NoIK(), 0).report(model, tiny.frames((20,)), "window")
-    assert report["offline"]
-    assert "offline" not in Evaluation(["window"], 4, NoIK(), 0).report(
-        tiny.baseline("bodiffusion"), tiny.frames((20,)), "window"
-    )
+    evaluate = partial(Evaluation(["window"], 4, NoIK(), 0).report, test=tiny.frames((20,)), mode="window")
+    assert evaluate(model)["offline"]
+    assert "offline" not in evaluate(tiny.baseline("bodiffusion"))

@@ -7,7 +7,7 @@ from memmlp.common.errors import InputError
 from memmlp.networks import checkpoint
 
 
-def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
+def test_a_checkpoint_is_read_whole_or_refused(tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     checkpoint.write(path, {"a": torch.arange(3)}, {"step": 3})
     (tmp_path / ".checkpoint.safetensors.1.tmp").write_bytes(b"half")
@@ -17,6 +17,11 @@ def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(InputError, match=r"checkpoint\.safetensors"):
         checkpoint.read(path)
+    module, other = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
+    collect = checkpoint.collect_module_tensors
+    tensors = collect("model", other) | collect("modelling", module)
+    checkpoint.load_module("model", module, tensors)
+    assert torch.equal(module.weight, other.weight)
 
 
 def test_a_checkpoint_that_is_replaced_while_it_is_read_is_the_old_one(tmp_path, monkeypatch):
@@ -32,12 +37,3 @@ def test_a_checkpoint_that_is_replaced_while_it_is_read_is_the_old_one(tmp_path,
     tensors, values = checkpoint.read(path)
     assert values == {"step": 3}
     assert torch.equal(tensors["a"], torch.arange(30))
-
-
-def test_a_module_is_loaded_from_its_own_tensors_alone():
-    module, other = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
-    tensors = checkpoint.collect_module_tensors("model", other) | checkpoint.collect_module_tensors(
-        "modelling", module
-    )
-    checkpoint.load_module("model", module, tensors)
-    assert torch.equal(module.weight, other.weight)

@@ -10,25 +10,20 @@ from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.networks.hmd_poser import NormedLSTM, locate_hands
 
 CLIP = tiny.clip(20)
-SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
 def test_hands_in_the_heads_frame_are_those_of_consecutive_frames():
     """The frame before is found from the velocities; here it is taken from the clip itself."""
-    rotations, turns, positions, velocities = (part[0].double().numpy() for part in locate_hands(SPARSE))
     poses = sixd_to_matrix(CLIP[:, :18].unflatten(-1, (3, 6))).double().numpy()
     places = CLIP[:, SPARSE_POSITION].unflatten(-1, (3, 3)).double().numpy()
-    own = [
-        [(poses[t, 0].T @ poses[t, 1 + h], poses[t, 0].T @ (places[t, 1 + h] - places[t, 0])) for h in (0, 1)]
-        for t in range(20)
-    ]
-    for t in range(1, 20):
-        for h in (0, 1):
-            (now, here), (before, there) = own[t][h], own[t - 1][h]
-            np.testing.assert_allclose(rotations[t, h], now[:, :2].T.flatten(), atol=1e-5)
-            np.testing.assert_allclose(turns[t, h], (before.T @ now)[:, :2].T.flatten(), atol=1e-5)
-            np.testing.assert_allclose(positions[t, h], here, atol=1e-5)
-            np.testing.assert_allclose(velocities[t, h], here - there, atol=1e-5)
+    back = poses[:, :1].swapaxes(-1, -2)
+    turned, place = back @ poses[:, 1:], (back @ (places[:, 1:] - places[:, :1])[..., None])[..., 0]
+    between = turned[:-1].swapaxes(-1, -2) @ turned[1:]
+    expected = (*(matrix[..., :2].swapaxes(-1, -2).reshape(-1, 2, 6) for matrix in (turned, between)), place)
+    for found, wanted in zip(
+        locate_hands(CLIP[None, :, :SPARSE_DIM]), (*expected, np.diff(place, axis=0)), strict=True
+    ):
+        np.testing.assert_allclose(found[0, 1:], wanted[-19:], atol=1e-5)
 
 
 @torch.no_grad()

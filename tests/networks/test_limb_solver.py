@@ -12,18 +12,7 @@ from memmlp.motion.body import SPARSE_POSITION as PLACES
 from memmlp.motion.body import SPARSE_ROTATION as TURNS
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.networks import limb_solver as limbs
-from memmlp.networks.limb_solver import (
-    BASES,
-    ELBOWS,
-    ENDS,
-    MIDDLES,
-    REACH_MARGIN,
-    SHOULDERS,
-    TOES,
-    WRISTS,
-    bend_arms_to_trackers,
-    use_tracker_rotations,
-)
+from memmlp.networks.limb_solver import BASES, ELBOWS, ENDS, MIDDLES, SHOULDERS, TOES, WRISTS
 
 REST = tiny.REST.double()
 DRAW = torch.Generator().manual_seed(0)
@@ -43,17 +32,18 @@ def person(count: int = 40) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return local, *forward_kinematics(local, torch.zeros(count, 3).double(), REST)
 
 
+LENGTHS = [bone.norm(dim=-1) for bone in limbs.find_bones(REST)[:2]]
+"""Of the upper and lower bones of each limb (4,), the arms first."""
+
+
 def reachable(base: torch.Tensor) -> torch.Tensor:
     """Ends that every limb can reach."""
-    upper, lower, _ = limbs.find_bones(REST)
-    longest = upper.norm(dim=-1) + lower.norm(dim=-1)
     share = 0.3 + 0.65 * torch.rand(*base.shape[:2], generator=DRAW).double()
-    return base + unit(*base.shape) * (share * longest)[..., None]
+    return base + unit(*base.shape) * (share * sum(LENGTHS))[..., None]
 
 
 @pytest.fixture(scope="module")
 def body() -> dict[str, torch.Tensor]:
-    """Bodies before and after their limbs were solved."""
     local, turned, joints = person()
     base = joints[:, list(BASES)]
     given = {"end": reachable(base), "swivel": unit(40, 4, 2), "hands": sixd_to_matrix(drawn(40, 2, 6))}
@@ -81,14 +71,10 @@ def test_elbows_and_knees_bend_about_their_axes_and_roll_about_their_forearms(bo
     _, lower, axis = limbs.find_bones(REST)
     knees = body["made"][:, list(MIDDLES[2:])]
     torch.testing.assert_close(limbs.rotate(knees, axis[2:]), axis[2:].expand(40, -1, -1))
-    elbows = body["made"][:, list(MIDDLES[:2])]
-    bent = limbs.bend_middles(
-        *limbs.find_bones(REST), (body["end"] - body["base"]).norm(dim=-1, keepdim=True)
-    )[:, :2]
-    rolled = bent.mT @ elbows
-    torch.testing.assert_close(
-        limbs.rotate(rolled, lower[:2]), lower[:2].expand(40, -1, -1), atol=1e-9, rtol=0
-    )
+    reach = (body["end"] - body["base"]).norm(dim=-1, keepdim=True)
+    bent = limbs.bend_middles(*limbs.find_bones(REST), reach)[:, :2]
+    turned = limbs.rotate(bent.mT @ body["made"][:, list(MIDDLES[:2])], lower[:2])
+    torch.testing.assert_close(turned, lower[:2].expand(40, -1, -1), atol=1e-9, rtol=0)
 
 
 def test_a_middle_is_where_its_swivel_says_unless_its_twist_is_limited(body):
@@ -123,20 +109,17 @@ def test_the_smallest_turn_to_a_limit_is_what_a_search_finds():
 
 
 def test_swivels_are_an_independent_computation():
-    """In NumPy, limb by limb: the angle of the middle about the axis, from below the base's Y axis."""
+    """In NumPy: the angle of the middle about the axis, from below the base's Y axis."""
     base, middle, end, up = (drawn(5, 4, 3) for _ in range(4))
-    found = limbs.measure_swivels(base, middle, end, up).numpy()
+    found = limbs.measure_swivels(base, middle, end, up)
     lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
-    again = limbs.place_middle(base, end, up, torch.tensor(found), *lengths)
-    torch.testing.assert_close(again, middle)
-    for index in np.ndindex(5, 4):
-        a, m, e, y = (part.numpy()[index] for part in (base, middle, end, up))
-        n = (e - a) / np.linalg.norm(e - a)
-        down = -(y - (y @ n) * n)
-        away = (m - a) - ((m - a) @ n) * n
-        cosine = down @ away / np.linalg.norm(down) / np.linalg.norm(away)
-        sine = np.cross(down, away) @ -n / np.linalg.norm(down) / np.linalg.norm(away)
-        np.testing.assert_allclose(found[index], [cosine, sine], atol=1e-9)
+    torch.testing.assert_close(limbs.place_middle(base, end, up, found, *lengths), middle)
+    axis, bone, up = ((end - base).numpy(), (middle - base).numpy(), -up.numpy())
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    down, away = (part - (part * axis).sum(-1, keepdims=True) * axis for part in (up, bone))
+    sizes = np.linalg.norm(down, axis=-1) * np.linalg.norm(away, axis=-1)
+    cosine, sine = (down * away).sum(-1) / sizes, -(np.cross(down, away) * axis).sum(-1) / sizes
+    np.testing.assert_allclose(found.numpy(), np.stack([cosine, sine], -1), atol=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 5.0])
@@ -145,21 +128,13 @@ def test_what_is_out_of_reach_is_a_limb_as_straight_or_bent_as_can_be_with_finit
     base = joints[:, list(BASES)]
     end = (base + share * limbs.find_bones(REST)[0]).requires_grad_()
     swivel, toe = unit(3, 4, 2).requires_grad_(), drawn(3, 2, 3).requires_grad_()
-    hands = sixd_to_matrix(drawn(3, 2, 6))
-    made = limbs.solve_limbs(local, turned, base, end, swivel, hands, toe, REST)
+    made = limbs.solve_limbs(local, turned, base, end, swivel, sixd_to_matrix(drawn(3, 2, 6)), toe, REST)
     assert torch.isfinite(made).all()
     (made * drawn(*made.shape)).sum().backward()
     assert all(torch.isfinite(part.grad).all() for part in (end, swivel, toe))
     if share == 5:
         straight = forward_kinematics(made, torch.zeros(3, 3).double(), REST)[1]
-        upper, lower, _ = limbs.find_bones(REST)
-        reach = (straight[:, list(ENDS)] - base).norm(dim=-1)
-        assert (reach > 0.99 * (upper.norm(dim=-1) + lower.norm(dim=-1))).all()
-
-
-LENGTHS = [
-    (REST[child] - REST[joint]).norm(dim=-1) for joint, child in ((SHOULDERS, ELBOWS), (ELBOWS, WRISTS))
-]
+        assert ((straight[:, list(ENDS)] - base).norm(dim=-1) > 0.99 * sum(LENGTHS)).all()
 
 
 def random_body(bend: float = 0.4, count: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
@@ -183,7 +158,7 @@ def inputs(joints: torch.Tensor, hands: torch.Tensor) -> torch.Tensor:
 def within_reach(joints: torch.Tensor, share: float) -> torch.Tensor:
     """Return places (n, 2, 3) for the hands in random directions, at a share of the arms' length."""
     away = torch.randn(len(joints), 2, 3, generator=torch.Generator().manual_seed(3)).double()
-    return joints[:, SHOULDERS] + share * sum(LENGTHS)[:, None] * away / away.norm(dim=-1, keepdim=True)
+    return joints[:, SHOULDERS] + share * sum(LENGTHS)[:2, None] * away / away.norm(dim=-1, keepdim=True)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9, 1.2])
@@ -191,14 +166,11 @@ def test_hands_come_to_their_trackers_and_bones_keep_their_lengths(share: float)
     """Of a hand that is too far away the arm points at it, all but straight."""
     rotations, joints = random_body()
     hands = within_reach(joints, share)
-    turned, placed = bend_arms_to_trackers(rotations, joints, inputs(joints, hands), REST)
+    turned, placed = limbs.bend_arms_to_trackers(rotations, joints, inputs(joints, hands), REST)
     away = hands - joints[:, SHOULDERS]
-    nearest = joints[:, SHOULDERS] + away * min(1, (1 - REACH_MARGIN) / share)
+    nearest = joints[:, SHOULDERS] + away * min(1, (1 - limbs.REACH_MARGIN) / share)
     torch.testing.assert_close(placed[:, WRISTS], nearest)
-    for joint, child, length in zip((SHOULDERS, ELBOWS), (ELBOWS, WRISTS), LENGTHS, strict=True):
-        torch.testing.assert_close(
-            (placed[:, child] - placed[:, joint]).norm(dim=-1), length.expand(len(placed), 2)
-        )
+    for joint, child in ((SHOULDERS, ELBOWS), (ELBOWS, WRISTS)):
         bones = turned[:, joint] @ (REST[child] - REST[joint])[..., None]
         torch.testing.assert_close(placed[:, joint] + bones[..., 0], placed[:, child])
     torch.testing.assert_close(turned @ turned.mT, torch.eye(3).double().expand_as(turned))
@@ -207,7 +179,7 @@ def test_hands_come_to_their_trackers_and_bones_keep_their_lengths(share: float)
 def test_the_elbow_stays_on_its_side_of_the_way_to_the_hand():
     rotations, joints = random_body()
     hands = within_reach(joints, 0.7)
-    _, placed = bend_arms_to_trackers(rotations, joints, inputs(joints, hands), REST)
+    _, placed = limbs.bend_arms_to_trackers(rotations, joints, inputs(joints, hands), REST)
     axis = torch.nn.functional.normalize(hands - joints[:, SHOULDERS], dim=-1)
 
     def off_axis(positions: torch.Tensor) -> torch.Tensor:
@@ -222,15 +194,12 @@ def test_the_elbow_stays_on_its_side_of_the_way_to_the_hand():
 def test_head_and_wrists_turn_as_their_trackers_and_the_rest_stays():
     rotations, joints = random_body()
     sparse = inputs(joints, within_reach(joints, 0.7))
-    seen = sixd_to_matrix(
-        use_tracker_rotations(matrix_to_sixd(rotations).flatten(1), sparse).unflatten(-1, (N_JOINTS, 6))
-    )
-    torch.testing.assert_close(
-        seen[:, [HEAD, *HANDS]], sixd_to_matrix(sparse[:, TURNS].unflatten(-1, (3, 6)))
-    )
-    others = [joint for joint in range(N_JOINTS) if joint not in (HEAD, *HANDS)]
+    sixd = limbs.use_tracker_rotations(matrix_to_sixd(rotations).flatten(1), sparse)
+    seen, tracked = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6))), [HEAD, *HANDS]
+    torch.testing.assert_close(seen[:, tracked], sixd_to_matrix(sparse[:, TURNS].unflatten(-1, (3, 6))))
+    others = [joint for joint in range(N_JOINTS) if joint not in tracked]
     torch.testing.assert_close(seen[:, others], rotations[:, others])
-    turned, placed = bend_arms_to_trackers(seen, joints, sparse, REST)
+    turned, placed = limbs.bend_arms_to_trackers(seen, joints, sparse, REST)
     kept = [joint for joint in range(N_JOINTS) if not SHOULDERS.start <= joint < ELBOWS.stop]
     assert torch.equal(turned[:, kept], seen[:, kept])
     assert torch.equal(placed[:, : ELBOWS.start], joints[:, : ELBOWS.start])
@@ -239,16 +208,12 @@ def test_head_and_wrists_turn_as_their_trackers_and_the_rest_stays():
 def test_a_straight_arm_bends_about_its_axis_and_gradients_are_finite():
     """The arms of the rest pose are made quite straight; drawn in, their elbows go to the back."""
     rest = REST.clone()
-    for k, away in ((0, 1.0), (1, -1.0)):
-        shoulder = rest[16 + k]
-        rest[18 + k], rest[20 + k] = (
-            shoulder + away * length * torch.eye(3)[0].double() for length in (0.25, 0.5)
-        )
+    along = torch.tensor([[0.25, 0, 0], [-0.25, 0, 0]]).double()
+    rest[ELBOWS], rest[WRISTS] = rest[SHOULDERS] + along, rest[SHOULDERS] + 2 * along
     rotations = torch.eye(3).double().expand(1, N_JOINTS, 3, 3).clone().requires_grad_()
     joints = rest[None].clone().requires_grad_()
     hands = rest[None, SHOULDERS] + 0.7 * (rest[None, WRISTS] - rest[None, SHOULDERS])
-    turned, placed = bend_arms_to_trackers(rotations, joints, inputs(joints.detach(), hands), rest)
+    turned, placed = limbs.bend_arms_to_trackers(rotations, joints, inputs(joints.detach(), hands), rest)
     assert (placed[0, ELBOWS, 2] - rest[ELBOWS, 2] < -0.1).all()  # Z is to the front in the rest pose
     (turned.sum() + placed.sum()).backward()
-    assert rotations.grad.isfinite().all()
-    assert joints.grad.isfinite().all()
+    assert all(part.grad.isfinite().all() for part in (rotations, joints))

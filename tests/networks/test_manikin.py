@@ -13,10 +13,11 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import manikin
 from memmlp.networks.limb_solver import BASES, ENDS, MIDDLES
 from memmlp.networks.manikin import PLACED_JOINTS, PREDICTED_JOINTS, PredictedParts, TrueParts
+from memmlp.networks.motion_model import MotionModel
 
 TRUTH = torch.stack([tiny.clip(7, seed) for seed in (1, 2)]).double()
 SPARSE, MOTION = TRUTH[..., :SPARSE_DIM], TRUTH[..., SPARSE_DIM:]
-NAMES = ("manikin_s", "manikin_l")
+WORLD = Normalizer.from_coordinates(World(), tiny.REST).double()
 
 
 def outputs() -> torch.Tensor:
@@ -30,7 +31,6 @@ def outputs() -> torch.Tensor:
 
 
 def posed_globally(motion: torch.Tensor) -> torch.Tensor:
-    """Global rotations of motion."""
     local = sixd_to_matrix(motion[..., ROTATION].unflatten(-1, (22, 6)))
     return forward_kinematics(local, torch.zeros_like(local[..., 0, :, 0]), tiny.REST.double())[0]
 
@@ -38,21 +38,23 @@ def posed_globally(motion: torch.Tensor) -> torch.Tensor:
 @torch.no_grad()
 def test_the_true_parts_make_the_true_trunk_hands_and_ankles():
     """And the head and wrists have their trackers' rotations; elbows and knees may reach a limit of twist."""
-    normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
-    rotation = PredictedParts.from_outputs(outputs(), normalizer).solve_pose(SPARSE, normalizer)
-    motion = normalizer.decode_rotations(rotation, SPARSE)
+    rotation = PredictedParts.from_outputs(outputs(), WORLD).solve_pose(SPARSE, WORLD)
+    motion = WORLD.decode_rotations(rotation, SPARSE)
     made, true = (part[..., POSITION].unflatten(-1, (22, 3)) for part in (motion, MOTION))
-    trunk = [0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17]
+    trunk, tracked = [0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17], [15, 20, 21]
     torch.testing.assert_close(made[..., trunk, :], true[..., trunk, :], atol=1e-5, rtol=0)
     off = (made - true)[..., [*ENDS], :].norm(dim=-1)
     assert float(off.median()) < 1e-5  # a limb that reaches further than one hinge allows comes short
     assert float(off.max()) < 0.03
-    turned, wanted = posed_globally(motion), posed_globally(MOTION)
-    torch.testing.assert_close(
-        turned[..., [15, 20, 21], :, :], wanted[..., [15, 20, 21], :, :], atol=1e-5, rtol=0
-    )
-    middles = (made - true)[..., [*MIDDLES], :].norm(dim=-1)
-    assert float(middles.quantile(0.1)) < 1e-3
+    found, expected = (posed_globally(part)[..., tracked, :, :] for part in (motion, MOTION))
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    assert float((made - true)[..., [*MIDDLES], :].norm(dim=-1).quantile(0.1)) < 1e-3
+
+
+def in_world(name: str, **changes) -> MotionModel:
+    model = tiny.baseline(name, World(), **changes).double()
+    model.normalizer = WORLD
+    return model
 
 
 def filled(sixd: np.ndarray) -> np.ndarray:
@@ -64,15 +66,10 @@ def filled(sixd: np.ndarray) -> np.ndarray:
 
 def test_manikin_s_losses_are_an_independent_computation():
     """In NumPy, limb by limb, with the weights of its authors."""
-    model = tiny.baseline("manikin_s", World()).double()
-    normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
-    model.normalizer = normalizer
-    made = (
-        outputs()[:, -1:] + 0.1 * torch.randn(2, 1, 86, generator=torch.Generator().manual_seed(1)).double()
-    )
-    found = {
-        name: float(term) for name, term in model.compute_part_losses(made, TrueParts(MOTION[:, -1:])).items()
-    }
+    model = in_world("manikin_s")
+    noise = torch.randn(2, 1, 86, generator=torch.Generator().manual_seed(1)).double()
+    made = outputs()[:, -1:] + 0.1 * noise
+    found = model.compute_part_losses(made, TrueParts(MOTION[:, -1:]))
     raw = made[:, 0].numpy()
     true = MOTION[:, -1, POSITION].unflatten(-1, (22, 3)).numpy()
     sixd = MOTION[:, -1, ROTATION].unflatten(-1, (22, 6)).numpy()
@@ -101,36 +98,31 @@ def test_manikin_s_losses_are_an_independent_computation():
         "trunk_rotation": np.mean(rotations), "trunk_position": 5 * np.mean(rooted), "swivel": 0.1 * swivel,
         "middle": middle, "ankle": 5 * np.mean(ankles), "toe": 0.3 * np.mean(toes),
     }  # fmt: skip
-    assert found == pytest.approx(expected, rel=1e-3)
+    assert {name: float(term) for name, term in found.items()} == pytest.approx(expected, rel=1e-3)
 
 
 def test_manikin_s_standing_legs_teach_without_bound_nothing():
     """The axis that a swivel is counted from is nearly along a standing leg; none learns by it."""
-    model = tiny.baseline("manikin_s", World())
+    model, straight = tiny.baseline("manikin_s", World()), torch.tensor([1.0, 0, 0, 0, 1, 0])
     torch.manual_seed(0)
     made = model.predict_parts(torch.randn(1, model.frames, SPARSE_DIM)).detach()
     mean, std = (
         part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[[0, *PREDICTED_JOINTS]].flatten()
         for part in (model.normalizer.mean, model.normalizer.std)
     )
-    made[..., : len(mean)] = (
-        torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(1 + len(PREDICTED_JOINTS)) - mean
-    ) / std
+    made[..., : len(mean)] = (straight.repeat(1 + len(PREDICTED_JOINTS)) - mean) / std
     made.requires_grad_()
-    joints = model.normalizer.rest.new_zeros(1, 1, N_JOINTS, 3)
-    for base, middle, end in zip(BASES, MIDDLES, ENDS, strict=True):
-        joints[..., middle, :] = torch.tensor([0.01, -0.4, 0.02])
-        joints[..., end, :] = torch.tensor([1e-3, -0.8, 5e-4])
-        joints[..., base, :] = 0
-    sixd = torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(N_JOINTS)
-    motion = torch.cat([sixd.expand(1, 1, -1), joints.flatten(-2)], -1)
+    joints = torch.zeros(1, 1, N_JOINTS, 3)
+    joints[..., list(MIDDLES), :] = torch.tensor([0.01, -0.4, 0.02])
+    joints[..., list(ENDS), :] = torch.tensor([1e-3, -0.8, 5e-4])
+    joints[..., list(BASES), :] = 0
+    motion = torch.cat([straight.repeat(N_JOINTS).expand(1, 1, -1), joints.flatten(-2)], -1)
     sum(model.compute_part_losses(made, TrueParts(motion)).values()).backward()
     assert made.grad.abs().max() < 10
 
 
 def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_way():
-    model = tiny.baseline("manikin_l", World()).double()
-    model.normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
+    model = in_world("manikin_l")
     auxiliary = MOTION[..., ROTATION][..., 6:]
     made = torch.cat([outputs(), auxiliary], -1)
     true = TrueParts(MOTION)
@@ -146,28 +138,20 @@ def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_w
     assert found == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["manikin_s", "manikin_l"])
 def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_back(name, monkeypatch):
     """Each window by its own; in coordinates of the heading it makes no difference at all."""
-    model, seen = tiny.baseline(name, Heading()).double(), []
+    model, world, seen = tiny.baseline(name, Heading()).double(), in_world(name), []
     model.normalizer = Normalizer.from_coordinates(Heading(), tiny.REST).double()
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[[0.1]], [[0.7]]]).double())
-    state = model.initial_state(2)
-    expected = model.advance(SPARSE, state)[0]
-    motion, *_ = model.compute_training_outputs(SPARSE, state, TRUTH)
-    torch.testing.assert_close(motion, expected[:, -motion.shape[1] :], atol=1e-6, rtol=0)
-    world = tiny.baseline(name, World()).double()
-    world.normalizer = Normalizer.from_coordinates(World(), tiny.REST).double()
-    predicted = world.predict_parts
+    state, predicted = model.initial_state(2), world.predict_parts
+    for one, atol in ((model, 1e-6), (in_world(name, turned=False), 1e-12)):
+        motion, *_ = one.compute_training_outputs(SPARSE, state, TRUTH)
+        expected = one.advance(SPARSE, state)[0][:, -motion.shape[1] :]
+        torch.testing.assert_close(motion, expected, atol=atol, rtol=0)
     world.predict_parts = lambda encoded: (seen.append(encoded), predicted(encoded))[1]
     world.compute_training_outputs(SPARSE, state, TRUTH)
-    heads = [window[..., 36:39][:, -world.frames :] for window in (SPARSE, seen[0])]
-    torch.testing.assert_close(heads[0][..., 2], heads[1][..., 2])
-    torch.testing.assert_close(heads[0][..., :2].norm(dim=-1), heads[1][..., :2].norm(dim=-1))
-    assert not torch.allclose(heads[0], heads[1], atol=1e-3)
-    still = tiny.baseline(name, World(), turned=False).double()
-    still.normalizer = world.normalizer
-    torch.testing.assert_close(
-        still.compute_training_outputs(SPARSE, state, TRUTH)[0],
-        still.advance(SPARSE, state)[0][:, -motion.shape[1] :],
-    )
+    here, there = (window[..., 36:39][:, -world.frames :] for window in (SPARSE, seen[0]))
+    torch.testing.assert_close(here[..., 2], there[..., 2])
+    torch.testing.assert_close(here[..., :2].norm(dim=-1), there[..., :2].norm(dim=-1))
+    assert not torch.allclose(here, there, atol=1e-3)

@@ -12,10 +12,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import LSTMMemory, NoMemory
 from memmlp.networks.own_past_memory import CodeMemory, CodeMemorySettings
-from memmlp.networks.predictor import (
-    TwoBranch,
-    TwoBranchSettings,
-)
+from memmlp.networks.predictor import TwoBranch, TwoBranchSettings
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.rollout import TeacherForcing
 
@@ -23,8 +20,7 @@ SPARSE = tiny.clip(40)[None, :, :SPARSE_DIM]
 
 
 def run(model: MemMLP, sparse: torch.Tensor, new: int = 1) -> list[torch.Tensor]:
-    state = model.initial_state(len(sparse))
-    outputs = []
+    state, outputs = model.initial_state(len(sparse)), []
     for part in sparse.split(new, 1):
         output, state = model.advance(part, state)
         outputs.append(output)
@@ -34,8 +30,7 @@ def run(model: MemMLP, sparse: torch.Tensor, new: int = 1) -> list[torch.Tensor]
 def test_paper_profile_has_the_papers_parameters():
     """4.10 M within 3 %: trainable parameters, the frozen VQ-VAE not counted (Table 16)."""
     sizes = {"hidden": 512, "frames": 41}
-    read = {"fusion": "residual", "shift": "window", "history": "first"}
-    keys = CodeMemorySettings(layers=[2, 4, 6, 8], width=192, **read)
+    keys = CodeMemorySettings([2, 4, 6, 8], 192, fusion="residual", shift="window", history="first")
     memory = CodeMemory(keys, codes=VQVAE(), depth=8, **sizes)
     normalizer = Normalizer.from_coordinates(HeadRelative(), torch.tensor(make_builtin_rest_joints()))
     model = MemMLP(normalizer, memory, TwoBranch(TwoBranchSettings(2), **sizes), depth=8, **sizes)
@@ -43,39 +38,24 @@ def test_paper_profile_has_the_papers_parameters():
     assert abs(model.count_parameters() / 4.10e6 - 1) < 0.03
 
 
-@pytest.mark.parametrize("shift", ["frame", "window"])
+@pytest.mark.parametrize(("shift", "new"), [("frame", 1), ("window", 1), ("frame", 7), ("window", 7)])
 @torch.no_grad()
-def test_memory_sees_the_shifted_past(shift):
-    """Derived independently: the past of frame t is the inputs and own first estimates `shift` earlier."""
-    model = tiny.model(CodeMemory, shift=shift)
-    seen = []
+def test_memory_sees_the_shifted_past_or_that_of_the_window_before(shift, new):
+    """The past of frame t is the inputs and own first estimates `shift` earlier; in calls of a window it is,
+    whatever the shift, the inputs and the output of the call before.
+    """
+    model, seen = tiny.model(CodeMemory, shift=shift), []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
-    outputs = run(model, SPARSE)
-    back, size, t = {"frame": 1, "window": model.frames}[shift], model.frames, 30
-    span = slice(t - back - size + 1, t - back + 1)
-    origin = model.normalizer.find_origin(SPARSE)
-    torch.testing.assert_close(seen[t].sparse, model.normalizer.encode_sparse(SPARSE, origin)[:, span])
-    own = torch.stack([output[0, -1] for output in outputs])[None]
-    torch.testing.assert_close(
-        seen[t].motion, model.normalizer.encode_motion(own, origin)[:, span], atol=1e-5, rtol=0
-    )
-
-
-@pytest.mark.parametrize("shift", ["frame", "window"])
-@torch.no_grad()
-def test_the_past_of_a_call_of_a_window_is_the_window_before(shift):
-    """Whatever the shift, the past is the inputs and the output of the call before."""
-    model = tiny.model(CodeMemory, shift=shift)
-    seen = []
-    model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
-    size, sparse = model.frames, SPARSE[:, : 3 * model.frames]
-    outputs = run(model, sparse, new=size)
-    origin = model.normalizer.find_origin(sparse)[:, size : 2 * size]
-    before = model.normalizer.encode_sparse(sparse[:, size : 2 * size], origin)
-    torch.testing.assert_close(seen[2].sparse, before)
-    torch.testing.assert_close(
-        seen[2].motion, model.normalizer.encode_motion(outputs[1], origin), atol=1e-5, rtol=0
-    )
+    size, call, sparse = model.frames, 28 // new, SPARSE[:, :35]
+    outputs = run(model, sparse, new)
+    origin = model.normalizer.find_origin(sparse)
+    back = 1 if (shift, new) == ("frame", 1) else size
+    end = (call + 1) * new - back  # of the past; with calls of a window, features have the call's own origin
+    span = slice(end - size, end)
+    own = torch.cat([output[:, -new:] for output in outputs], 1)[:, span]
+    torch.testing.assert_close(seen[call].sparse, model.normalizer.encode_sparse(sparse, origin)[:, span])
+    motion = model.normalizer.encode_motion(own, origin[:, span])
+    torch.testing.assert_close(seen[call].motion, motion, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("shift", "back"), [("frame", 1), ("window", 7)])

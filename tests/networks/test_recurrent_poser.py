@@ -1,13 +1,14 @@
 """RecurrentPoser: a stream whatever the calls, its graph, its sizes, its switches."""
 
+import exported
 import numpy as np
 import onnx
 import pytest
 import tiny
 import torch
+from scipy.special import expit as sigmoid
 
 from memmlp.config.build import build_untrained
-from memmlp.deploy.export import export
 from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.evaluation import modes as evaluation
@@ -90,23 +91,20 @@ def test_cells_stay_exact_where_layers_are_rounded(cell):
 )
 def test_parameters(profile, members, width, depth):
     """A block's GRU is 6 d d + 6 d, its MLP of d hidden units 2 d d + 2 d, its two norms 4 d."""
-    model = build_untrained(["model=recurrent_poser", f"profile={profile}"])
+    found = build_untrained(["model=recurrent_poser", f"profile={profile}"]).count_parameters()
     ends = 54 * width + width + 2 * width + 132 * width + 132
-    assert model.count_parameters() == members * (depth * (8 * width**2 + 12 * width) + ends)
-    assert model.count_parameters() < 4_200_000
+    assert found == members * (depth * (8 * width**2 + 12 * width) + ends) < 4_200_000
 
 
 @pytest.mark.slow
-def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
-    model, exact, int8 = (
-        tiny.recurrent_poser(Heading(), width=40),
-        tmp_path / "step.onnx",
+def test_the_file_is_the_network_and_its_cells_become_int8(step_files, tmp_path):
+    model, int8, exact = (
+        exported.NETWORKS["recurrent_poser"](),
         tmp_path / "int8.onnx",
+        step_files("recurrent_poser"),
     )
-    stream = make_streaming_graph(model)
-    export(stream, exact, "0" * 16)
     assert measure_largest_difference(model, exact, CLIP) <= TOLERANCE
-    write_lower_precision("int8", exact, int8, stream, [CLIP[:20]])
+    write_lower_precision("int8", exact, int8, make_streaming_graph(model), [CLIP[:20]])
     graph = onnx.load(int8).graph
     types = {tensor.name: tensor.data_type for tensor in graph.initializer}
     given = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}
@@ -128,35 +126,11 @@ def cell(name: str) -> tuple[RecurrentCell, torch.Tensor]:
     return made, torch.randn(2, 4 * made.carried).double()
 
 
-def sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-x))
-
-
-@pytest.mark.parametrize("name", CELLS)
-@torch.no_grad()
-def test_steps_are_the_sequence_however_it_is_cut(name):
-    made, state = cell(name)
-    whole, last = made(X, state)
-    first, between = made(X[:, :5], state)
-    second, end = made(X[:, 5:], between)
-    torch.testing.assert_close(torch.cat([first, second], 1), whole, atol=1e-12, rtol=0)
-    stepped = []
-    for frame in X.unbind(1):
-        out, state = made.step(frame, state)
-        stepped.append(out)
-    torch.testing.assert_close(torch.stack(stepped, 1), whole, atol=1e-12, rtol=0)
-    for found in (end, state):
-        torch.testing.assert_close(found, last, atol=1e-12, rtol=0)
-
-
 @pytest.mark.parametrize("length", [1, 2, 7, 8])
 def test_the_scan_is_the_recurrence(length):
     random = np.random.default_rng(0)
-    keep, new, state = (
-        random.random((2, length, 3)),
-        random.normal(size=(2, length, 3)),
-        random.normal(size=(2, 3)),
-    )
+    keep, new = random.random((2, length, 3)), random.normal(size=(2, length, 3))
+    state = random.normal(size=(2, 3))
     found = scan_linear_recurrence(*map(torch.tensor, (keep, new, state)))
     for t in range(length):
         state = keep[:, t] * state + new[:, t]
@@ -168,12 +142,9 @@ def test_a_minimal_gru_is_its_equation():
     """h = (1 - z) h + z W x with z = sigmoid(V x)."""
     made, state = cell("mingru")
     found, h = made(X, state)[0], state.numpy()
-    (gate, new), (gate_bias, new_bias) = (
-        np.split(part.numpy(), 2) for part in (made.linear.weight, made.linear.bias)
-    )
-    for t, x in enumerate(X.numpy().swapaxes(0, 1)):
-        z = sigmoid(x @ gate.T + gate_bias)
-        h = (1 - z) * h + z * (x @ new.T + new_bias)
+    for t, x in enumerate(made.linear(X).numpy().swapaxes(0, 1)):
+        gate, new = np.split(x, 2, -1)
+        h = (1 - sigmoid(gate)) * h + sigmoid(gate) * new
         np.testing.assert_allclose(found[:, t], h, atol=1e-12)
 
 
@@ -182,9 +153,8 @@ def test_a_linear_recurrent_unit_is_its_equation():
     """h = a h + sqrt(1 - a^2) i x with a = exp(-softplus(decay) r), gates r and i by sigmoids."""
     made, state = cell("lru")
     found, h = made(X, state)[0], state.numpy()
-    weights, biases = (np.split(part.numpy(), 3) for part in (made.linear.weight, made.linear.bias))
-    for t, x in enumerate(X.numpy().swapaxes(0, 1)):
-        r, i, new = (x @ weight.T + bias for weight, bias in zip(weights, biases, strict=True))
+    for t, x in enumerate(made.linear(X).numpy().swapaxes(0, 1)):
+        r, i, new = np.split(x, 3, -1)
         a = np.exp(-np.log1p(np.exp(made.decay.numpy())) * sigmoid(r))
         h = a * h + np.sqrt(1 - a**2) * sigmoid(i) * new
         np.testing.assert_allclose(found[:, t], h, atol=1e-9)

@@ -1,7 +1,5 @@
 """A refiner behind any network: it corrects the stream, and carries no more than its own states."""
 
-from __future__ import annotations
-
 import pytest
 import tiny
 import torch
@@ -12,42 +10,31 @@ from memmlp.evaluation.ik import Arms
 from memmlp.evaluation.modes import extract_positions
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.refiner import RefinedModel
 
 CLIP = tiny.clip(24).double()
 SPARSE = CLIP[None, :, :SPARSE_DIM]
-NETWORKS = ["mem_mlp", "agrol_mlp", "avatar_poser", "hmd_poser", "rpm"]
 
 
-def network(name: str) -> RefinedModel:
-    one = tiny.model(coordinates=Heading()) if name == "mem_mlp" else tiny.baseline(name, Heading())
-    return tiny.refined(one).double()
-
-
-@pytest.mark.parametrize("name", ["avatar_poser", "vae_hmd"])
-def test_it_has_the_published_size(name):
+def test_it_has_the_published_size():
     """VAE-HMD leaves out of its count what only training uses, behind a refiner as well."""
-    bare, refined = (
-        build_untrained(["profile=paper", f"model={name}", *words]) for words in ([], ["refiner=sage"])
-    )
+    words = ["profile=paper", "model=vae_hmd"]
+    bare, refined = build_untrained(words), build_untrained([*words, "refiner=sage"])
     assert refined.count_parameters() - bare.count_parameters() == 2_635_908
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", ["mem_mlp", "rpm"])
 @torch.no_grad()
 def test_it_corrects_the_networks_stream(name):
     """Computed here by torch's own recurrent layers over the whole stream, frame after frame."""
-    model = network(name)
+    network = tiny.model(coordinates=Heading()) if name == "mem_mlp" else tiny.baseline(name, Heading())
+    model = tiny.refined(network).double()
     bare, made = (modes.predict_stream(one, [CLIP])[0] for one in (model.network, model))
     expected = bare[:, ROTATION] + model.head(model.layers(bare[None, :, ROTATION])[0])[0]
     torch.testing.assert_close(made[:, ROTATION], expected)
     assert not torch.allclose(made[:, ROTATION], bare[:, ROTATION], atol=1e-3)
-    positions = (
-        model.normalizer.compute_positions(made, SPARSE[0]).flatten(1)
-        if name != "mem_mlp"
-        else bare[:, POSITION]
-    )
+    positions = bare[:, POSITION]
+    if name != "mem_mlp":
+        positions = model.normalizer.compute_positions(made, SPARSE[0]).flatten(1)
     torch.testing.assert_close(made[:, POSITION], positions)
     assert torch.equal(modes.predict_windows(model, [CLIP])[0], made)
 
@@ -61,11 +48,8 @@ def test_arms_that_it_moves_off_their_trackers_reach_again_by_inverse_kinematics
     clip[:, SPARSE_POSITION.start + 3 : SPARSE_POSITION.stop] = hands.flatten(1)
     (reaching,), (moved,) = modes.predict_stream(model.network, [clip]), modes.predict_stream(model, [clip])
     again = Arms().solutions(model.normalizer, moved, clip[:, :SPARSE_DIM])["combined"]
-    found = [
-        model.normalizer.compute_positions(motion, clip[:, :SPARSE_DIM])
-        for motion in (reaching, again, moved)
-    ]
-    away = [float((joints[:, list(HANDS)] - hands).norm(dim=-1).mean()) for joints in found]
-    assert away[0] < 0.001
-    assert away[1] < 0.02
-    assert away[2] > 0.1
+    away = []
+    for motion in (reaching, again, moved):
+        joints = model.normalizer.compute_positions(motion, clip[:, :SPARSE_DIM])
+        away.append(float((joints[:, list(HANDS)] - hands).norm(dim=-1).mean()))
+    assert [one < limit for one, limit in zip(away, (0.001, 0.02, 0.1), strict=True)] == [True, True, False]

@@ -1,6 +1,5 @@
 """SAGE-Net's networks: published sizes, shapes, the quantiser."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -15,15 +14,12 @@ SMALL = SAGESettings(20, 16, 1, 2, 16, 1, 2)
 def test_published_sizes():
     """Table 16 counts both diffusion models and the decoder."""
     with torch.device("meta"):
-        made = [
-            *(sage_parts.HalfVQVAE(half, PAPER) for half in (sage_parts.UPPER, sage_parts.LOWER)),
-            *(
-                kind(PAPER)
-                for kind in (sage_parts.UpperDenoiser, sage_parts.LowerDenoiser, sage_parts.Decoder)
-            ),
-        ]
+        made = [sage_parts.HalfVQVAE(half, PAPER) for half in (sage_parts.UPPER, sage_parts.LOWER)]
+        made += [getattr(sage_parts, name)(PAPER) for name in ("UpperDenoiser", "LowerDenoiser", "Decoder")]
     sizes = [sum(p.numel() for p in part.parameters()) for part in made]
     assert sizes == [7_239_436, 7_200_986, 57_969_432, 58_264_728, 4_035_374]
+    assert find_batch_dependent_layers(sage_parts.HalfVQVAE(sage_parts.LOWER, SMALL)) == ["ProductQuantiser"]
+    assert find_batch_dependent_layers(sage_parts.LowerDenoiser(SMALL)) == []
 
 
 @torch.no_grad()
@@ -43,15 +39,11 @@ def test_the_shapes_of_a_window_on_its_way_through_the_parts():
 def test_the_nearest_code_of_each_book_stands_for_its_part():
     quantiser, z = sage_parts.ProductQuantiser().eval(), torch.randn(2, 5, 384)
     found, loss = quantiser(z)
-    expected = np.zeros((10, 384), dtype=np.float32)
-    for row, latent in enumerate(z.flatten(0, 1).numpy()):
-        for book in range(8):
-            part, vectors = slice(48 * book, 48 * book + 48), quantiser.vectors[book].numpy()
-            expected[row, part] = vectors[((vectors - latent[part]) ** 2).sum(-1).argmin()]
-    np.testing.assert_allclose(found.flatten(0, 1).numpy(), expected, atol=1e-5)
-    assert float(loss) == pytest.approx(
-        2 * float(((z.flatten(0, 1).numpy() - expected) ** 2).mean()), rel=1e-4
-    )
+    books = z.unflatten(-1, (8, 48)).flatten(0, 1).transpose(0, 1)  # (8, 10, 48)
+    nearest = torch.cdist(books, quantiser.vectors).argmin(-1)
+    expected = torch.stack([vectors[row] for vectors, row in zip(quantiser.vectors, nearest, strict=True)], 1)
+    torch.testing.assert_close(found, expected.reshape(z.shape), atol=1e-5, rtol=0)
+    assert float(loss) == pytest.approx(2 * float((z - expected.reshape(z.shape)).square().mean()), rel=1e-4)
 
 
 def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through():
@@ -63,8 +55,3 @@ def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through(
     assert float((quantiser.vectors - before).detach().norm(dim=-1).median()) > 10
     loss.backward()
     assert quantiser.vectors.grad.any()
-
-
-def test_several_processes_would_count_codes_each_by_itself():
-    assert find_batch_dependent_layers(sage_parts.HalfVQVAE(sage_parts.LOWER, SMALL)) == ["ProductQuantiser"]
-    assert find_batch_dependent_layers(sage_parts.LowerDenoiser(SMALL)) == []

@@ -1,7 +1,5 @@
 """Devices by their names, and what a manifest says of them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -12,12 +10,10 @@ from memmlp.training.devices import choose_device, describe_missing_gpu, describ
 
 @pytest.fixture
 def gpus(monkeypatch: pytest.MonkeyPatch):
-    """Make torch find so many GPUs of CUDA."""
-
     def there(count: int) -> None:
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
-        monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
-        monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+        answers = {"is_available": count > 0, "device_count": count, "current_device": 0}
+        for name, answer in answers.items():
+            monkeypatch.setattr(torch.cuda, name, lambda answer=answer: answer)
         monkeypatch.setattr(torch.cuda, "get_device_name", lambda used: f"Card {used.index}")
 
     return there
@@ -65,14 +61,10 @@ def test_of_several_processes_each_has_its_own(gpus, monkeypatch: pytest.MonkeyP
 
 def test_a_gpu_that_torch_cannot_use_is_told(gpus, monkeypatch, tmp_path):
     for name, visible, count, driver, said in (
-        ("auto", None, 0, True, True),
-        ("auto", "0", 0, True, True),
-        ("auto", None, 1, True, False),  # torch uses it
-        ("auto", "", 0, True, False),  # hidden on purpose
-        ("auto", "-1", 0, True, False),
-        ("auto", None, 0, False, False),  # there is none
-        ("cpu", None, 0, True, False),
-    ):
+        ("auto", None, 0, True, True), ("auto", "0", 0, True, True), ("cpu", None, 0, True, False),
+        ("auto", None, 1, True, False), ("auto", None, 0, False, False),  # torch uses it; there is none
+        ("auto", "", 0, True, False), ("auto", "-1", 0, True, False),  # hidden on purpose
+    ):  # fmt: skip
         gpus(count)
         monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
         if visible is not None:

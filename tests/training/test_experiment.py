@@ -1,7 +1,5 @@
 """Every key of the config is changed once: an identity changes exactly where a stage's result does."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator
@@ -61,28 +59,16 @@ CHANGES: dict[str, str] = {
 }  # fmt: skip
 
 UNTRIED = {
-    "paths.outputs": "where results lie",
-    "data.root": "where the same clips lie; another folder's are another digest",
-    "data.sources": "other folders are another digest; weights: tests/config/test_build_motion.py",
-    "data.synth": "makes other clips, and so another digest: see the test below",
-    "data.interpolation": "here all clips have 60 Hz: tests/motion/preparing/test_cache.py",
-    "data.body": "a file of the user's; its rest pose is in the data's digest",
-    "data.split.per_group": "here are no groups: tests/motion/preparing/test_splits.py",
-    "plugins": "changes no run by itself: tests/config/test_plugins.py",
-    "term": "one of a package of one's own: tests/config/test_plugins.py",
-    "optim.best_by": "keeps the weights of another validation: tests/training/test_best_weights.py",
-    "evaluation.metrics": "of a package of one's own: tests/config/test_plugins.py",
-    "prerequisite": "parts of SAGE-Net, each a run of its own: tests/training/test_sage.py",
-    "refiner": "a run of its own, behind the network's: tests/training/test_refiner.py",
-    "vqvae.epochs": "steps by another name: the two exclude each other (tests/config/test_compose.py)",
-}
-LAST_DIGITS = {
-    "threads": "recorded, and flagged in tables",
-    "device": "recorded, and flagged in tables",
-    "optim.compile": "counts though a compiler may leave every digit as it was",
-    "data.min_frames": "counts by the data's digest though here no clip is that short",
-}
-"""Keys that are asked for less than exactness, and why."""
+    "paths.outputs", "plugins",  # change no run
+    "data.root", "data.sources", "data.synth", "data.body",  # other clips or bodies are another digest
+    "data.interpolation", "data.split.per_group",  # of no use here: tests/motion/preparing
+    "term", "evaluation.metrics",  # of a package of one's own: tests/config/test_plugins.py
+    "prerequisite", "refiner",  # runs of their own: test_sage.py, test_refiner.py
+    "vqvae.epochs",  # steps by another name
+    "optim.best_by",  # keeps the weights of another validation: test_best_weights.py
+}  # fmt: skip
+LAST_DIGITS = {"threads", "device", "optim.compile", "data.min_frames"}
+"""Keys that may leave every digit as it was: recorded and flagged, or of no effect here."""
 NOWHERE = {
     "force", "save_predictions", "data.name", "data.strict", "optim.checkpoint_every", "optim.log_every",
     "optim.validate_every", "evaluation.modes", "evaluation.batch", "loggers.mlflow.uri",
@@ -102,7 +88,6 @@ class Outcome(NamedTuple):
 
 @pytest.fixture(scope="module", autouse=True)
 def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with the prepared data."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("identity"))
         clips(Path.cwd() / "clips")
@@ -130,7 +115,6 @@ def clips(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def base(home: Path) -> Outcome:
-    """The outcome of no change."""
     return outcome(home / "base", [])
 
 
@@ -146,9 +130,8 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
     model = experiment.architecture.load(run.model)
     found = data.open("test")
-    short = MotionDataset(
-        found.frames[:11], torch.tensor([0]), torch.tensor([11]), found.names[:1], found.groups[:1]
-    )
+    ends = torch.tensor([0]), torch.tensor([11])
+    short = MotionDataset(found.frames[:11], *ends, found.names[:1], found.groups[:1])
     evaluation = experiment.evaluation
     reports = {mode: evaluation.report(model, short, mode)["clips"] for mode in evaluation.modes}
     return Outcome(
@@ -170,14 +153,8 @@ def deployed(experiment: Experiment, model: Any, clip: MotionDataset) -> list[An
             motion, state = network.advance(clip.frames[None, t : t + 1, :54], state, 1)
             motions.append(motion.tolist())
     settings = experiment.deployment
-    return [
-        type(network).__name__,
-        settings.precision,
-        settings.opset,
-        settings.alone,
-        max(settings.latency_steps, 200),
-        motions,
-    ]
+    facts = settings.precision, settings.opset, settings.alone, max(settings.latency_steps, 200)
+    return [type(network).__name__, *facts, motions]
 
 
 def digest(value: Any) -> str:
@@ -189,7 +166,7 @@ def test_every_key_is_changed_or_said_not_to_be():
     config = flatten(OmegaConf.to_container(compose_config(BASE), resolve=True))  # type: ignore[arg-type]
     own = {key for key in config if key.rsplit(".", 1)[-1] != "name"}
     own |= {"data.name"}  # a slot's own name is fixed
-    assert {key for key in own if not key.startswith("profile.")} == CHANGES.keys() | UNTRIED.keys()
+    assert {key for key in own if not key.startswith("profile.")} == CHANGES.keys() | UNTRIED
 
 
 ALONE = [[key] for key in CHANGES if key not in {"optim.compile", *TOGETHER}]
@@ -198,14 +175,9 @@ ALONE = [[key] for key in CHANGES if key not in {"optim.compile", *TOGETHER}]
 @pytest.mark.parametrize("keys", [*ALONE, TOGETHER], ids=" ".join)
 def test_identity_moves_exactly_where_a_result_moves(base: Outcome, home: Path, keys: list[str]):
     other = outcome(home / keys[0], [f"{key}={CHANGES[key]}" for key in keys])
-    stages = [
-        name for name in base.results if name in other.results
-    ]  # a mode that is not asked for is left out
-    trained = other.identities["training"] != base.identities["training"]
-    moved = {
-        name: trained or (name != "training" and other.identities[name] != base.identities[name])
-        for name in stages
-    }
+    stages = base.results.keys() & other.results.keys()  # a mode that is not asked for is left out
+    ids = {name: other.identities[name] != base.identities[name] for name in stages}
+    moved = {name: ids["training"] or one for name, one in ids.items()}
     changed = {name: other.results[name] != base.results[name] for name in stages}
     if keys[0] in LAST_DIGITS:
         assert not any(changed.values()) or not any(moved.values())

@@ -1,11 +1,9 @@
 """Optimisers: what each does, that a resumed training is the same training, and which weights count."""
 
-from __future__ import annotations
-
+import copy
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from tiny_tasks import OPTIM, motion_task, weights
@@ -37,7 +35,6 @@ def kill(step: int, values: dict[str, float]) -> None:
 def trained(
     optim: Optim, folder: Path, on_validation: ValidationCallback | None = None
 ) -> tuple[MotionTask, Run]:
-    """A task after its training, and the run."""
     folder.mkdir(exist_ok=True)
     task, run = motion_task("forced", optim), Run(folder)
     train(task, optim, run, 0, "optim", on_validation)
@@ -81,9 +78,8 @@ def test_the_weights_that_are_validated_are_kept(name: str, averaged: bool, tmp_
 
 def test_muon_has_the_matrices_and_adamw_the_rest():
     matrix, row, cube = (torch.nn.Parameter(torch.rand(shape)) for shape in ((3, 4), (4,), (2, 3, 4)))
-    optimiser = replace(OPTIMS["muon"], other_lr=0.5).build(
-        [{"params": [matrix, row]}, {"params": [cube], "lr": 0.1, "weight_decay": 0.0}]
-    )
+    groups = [{"params": [matrix, row]}, {"params": [cube], "lr": 0.1, "weight_decay": 0.0}]
+    optimiser = replace(OPTIMS["muon"], other_lr=0.5).build(groups)
     muon, adamw = optimiser.parts
     assert [group["params"] for group in muon.param_groups] == [[matrix]]
     assert [group["params"] for group in adamw.param_groups] == [[row], [cube]]
@@ -125,56 +121,40 @@ def test_an_exponential_moving_average_by_hand():
     assert model.weight.item() == 8
 
 
-def network() -> nn.Linear:
-    torch.manual_seed(0)
-    return nn.Linear(3, 2)
-
-
-def parts(model: nn.Linear) -> list[torch.optim.Optimizer]:
-    return [torch.optim.SGD([model.weight], lr=0.1, momentum=0.9), torch.optim.AdamW([model.bias], lr=0.2)]
-
-
-def step(model: nn.Linear, *optimisers: torch.optim.Optimizer) -> None:
-    for optimiser in optimisers:
-        optimiser.zero_grad()
-    model(torch.ones(1, 3)).square().sum().backward()
-    for optimiser in optimisers:
-        optimiser.step()
-
-
 def test_it_does_what_its_parts_do_also_after_a_rate_was_changed_and_its_state_was_loaded():
-    alone, together = network(), network()
+    def parts(model: nn.Linear) -> list[torch.optim.Optimizer]:
+        return [torch.optim.SGD([model.weight], 0.1, momentum=0.9), torch.optim.AdamW([model.bias], lr=0.2)]
+
+    alone = nn.Linear(3, 2)
+    together, first = copy.deepcopy(alone), copy.deepcopy(alone)
     separate, composed = parts(alone), ComposedOptimiser(parts(together))
     for number in range(6):
-        for group in (*composed.param_groups, *(g for one in separate for g in one.param_groups)):
-            group["lr"] *= 0.9
-        step(alone, *separate)
-        step(together, composed)
+        for model, optimisers in ((alone, separate), (together, [composed])):
+            for optimiser in optimisers:
+                optimiser.zero_grad()
+            model(torch.ones(1, 3)).square().sum().backward()
+            for optimiser in optimisers:
+                for group in optimiser.param_groups:
+                    group["lr"] *= 0.9
+                optimiser.step()
         assert all(map(torch.equal, alone.parameters(), together.parameters()))
         if number == 2:
             state = composed.state_dict()
             composed = ComposedOptimiser(parts(together))
             composed.load_state_dict(state)
-    assert not torch.equal(alone.bias, network().bias)
+    assert not torch.equal(alone.bias, first.bias)
     assert list(composed.state_dict()["state"]) == [0, 1]
 
 
-def matrices(*shapes: tuple[int, int]) -> list[torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    return [torch.randn(shape, generator=generator).bfloat16() for shape in shapes]
-
-
 def test_products_are_exact_but_for_one_rounding():
-    a, b, c = matrices((9, 30), (30, 7), (9, 7))
-    left, right, added = (x.double().numpy() for x in (a, b, c))
-
-    def rounded(x: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(x).bfloat16()
-
+    draw = torch.Generator().manual_seed(0)
+    a, b, c = (torch.randn(shape, generator=draw).bfloat16() for shape in ((9, 30), (30, 7), (9, 7)))
+    left, right, added = (x.double() for x in (a, b, c))
     with Float32Products():
         plain, method, sum_ = a @ b, a.matmul(b), torch.addmm(c, a, b, beta=-4.775, alpha=2.0)
         assert (a + 1).dtype == torch.bfloat16
-    torch.testing.assert_close(plain, rounded(left @ right), rtol=2**-8, atol=0)
-    torch.testing.assert_close(sum_, rounded(-4.775 * added + 2 * left @ right), rtol=2**-8, atol=2**-8)
+    torch.testing.assert_close(plain, (left @ right).bfloat16(), rtol=2**-8, atol=0)
+    expected = (-4.775 * added + 2 * left @ right).bfloat16()
+    torch.testing.assert_close(sum_, expected, rtol=2**-8, atol=2**-8)
     assert torch.equal(plain, method)
     assert {x.dtype for x in (plain, method, sum_)} == {torch.bfloat16}

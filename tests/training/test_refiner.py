@@ -1,7 +1,5 @@
 """A refiner's run builds upon the run of its network, which is that without a refiner."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,9 +1,8 @@
 """Remarks on data before a run, and warnings in its manifest for tables."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest import mock
 
 from memmlp.motion.clip import SkippedFile
 from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
@@ -15,7 +14,6 @@ def clip(name: str, split: str, fps: float = 60.0, group: str = "tied") -> Simpl
 
 
 def warnings(clips: list[SimpleNamespace], name: str = "mine", part: dict | None = None, **facts) -> dict:
-    """The warnings on data with these clips and facts of its manifest."""
     whole = {"coverage": SimpleNamespace(is_complete=True), "listed": {"CMU": 1}, "split": {}, "unusual": {}}
     manifest = SimpleNamespace(clips=clips, **(whole | facts))
     return request.collect_data_warnings(
@@ -33,15 +31,12 @@ def test_remarks_count_the_clips_and_name_the_first():
         assert word in str(request.describe_unusual_clips(odd))
 
 
-def test_a_single_group_of_test_clips_is_too_few():
+def test_single_groups_and_divided_persons_are_facts_of_the_run():
     for groups, counts, few in (("abb", ("3", "2"), False), ("aa", ("2", "1"), True)):
         clips = [clip("c", "train"), *(clip("t", "test", group=group) for group in groups)]
         found = request.describe_test_clips(clips)
         assert all(count in found for count in counts)
         assert ("data.split.test" in found) == few
-
-
-def test_people_in_training_and_in_test_are_a_fact_of_the_run():
     names = (("CMU/01/a", "train"), ("CMU/01/b", "test"), ("CMU/02/c", "train"))
     clips = [clip(name, part, group=name) for name, part in names]
     found = warnings(clips)
@@ -54,19 +49,10 @@ def test_clips_that_were_recorded_at_a_lower_rate_are_said():
     rates = {"a": 30.0, "b": 30.0, "c": 60.0, "d": 59.94, "e": 120.0, "f": 100.0}
     clips = [*(clip(name, "test", fps) for name, fps in rates.items()), clip("g", "train", 25.0)]
     lines, splines = SimpleNamespace(interpolation="lines"), SimpleNamespace(interpolation="splines")
-    assert request.describe_low_rates(lines, clips, "clips").startswith(
-        "3 of 7 clips were recorded at 25 to 30"
-    )
+    assert "3 of 7 clips were recorded at 25 to 30" in request.describe_low_rates(lines, clips, "clips")
     assert request.describe_low_rates(lines, clips[2:6], "clips") is None
     assert request.describe_low_rates(splines, clips, "clips") is None
-    assert warnings(clips, interpolation="lines")["resampled"].startswith(
-        "2 of 6 test clips were recorded at 30 Hz"
-    )
-
-
-class Coverage(SimpleNamespace):
-    def __str__(self) -> str:
-        return "7 of 8"
+    assert "2 of 6 test clips were" in warnings(clips, interpolation="lines")["resampled"]
 
 
 def test_a_part_of_the_data_is_told():
@@ -79,7 +65,8 @@ def test_a_part_of_the_data_is_told():
         (False, 0.5, "s1, 7 of 8, 50 % of its training groups"),
     ):
         part = {} if fraction is None else {"train_fraction": fraction}
-        found = warnings([], "s1", part, coverage=Coverage(is_complete=whole), interpolation="lines")
+        coverage = mock.MagicMock(is_complete=whole, __str__=lambda _: "7 of 8")
+        found = warnings([], "s1", part, coverage=coverage, interpolation="lines")
         assert found["partial"] == words
 
 

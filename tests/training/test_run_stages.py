@@ -3,6 +3,7 @@
 import importlib
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from begun_runs import begun
 from command_line import TINY
 from command_line import run as command
 from conftest import INT8
@@ -40,6 +42,10 @@ def motion_run(folder: Path) -> Run:
     return [run for run in list_runs(folder / "outputs") if run.manifest["kind"] == "memmlp"][-1]
 
 
+def stages(run: Run) -> list[str]:
+    return [path.stem for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
+
+
 def test_a_run_leaves_everything(home):
     run = motion_run(home)
     assert run.done
@@ -47,8 +53,7 @@ def test_a_run_leaves_everything(home):
     for name in ("config.yaml", "manifest.json", "metrics.jsonl", "checkpoint.safetensors"):
         assert (run.folder / name).stat().st_size > 0
     assert run.preferred_deployment.done
-    made = [path.stem for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
-    assert set(run.requested_stages) == set(made)
+    assert set(run.requested_stages) == set(stages(run))
     assert set(run.results) == {"window", "stream", "latency"}
     assert {run.manifest[fact] for fact in ("partial", "divided", "resampled", "unusual")} == {None}
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
@@ -66,14 +71,9 @@ def test_a_run_leaves_everything(home):
         assert len(picture.convert("RGB").getcolors(10**6)) > 50
     report = json.loads(next(run.evaluations.glob("stream-*.json")).read_text())
     assert report["run"] == run.id
-    assert report["component_versions"] == {
-        "metrics": VERSIONS["metrics"],
-        "mode.stream": VERSIONS["mode.stream"],
-    }
-    assert (
-        load_measured_run(run.folder).origin.component_versions.items()
-        >= {**run.manifest["component_versions"], **report["component_versions"]}.items()
-    )
+    assert report["component_versions"] == {name: VERSIONS[name] for name in ("metrics", "mode.stream")}
+    versions = run.manifest["component_versions"] | report["component_versions"]
+    assert load_measured_run(run.folder).origin.component_versions.items() >= versions.items()
     graph = onnx.load(run.onnx)
     assert {p.key: p.value for p in graph.metadata_props}["run_id"] == run.id
     out = (home / "out.txt").read_text()
@@ -111,15 +111,17 @@ def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
     assert run.done
 
 
-def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
+def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home, monkeypatch):
     """A trained run takes not one step more, and its own results stay what they were."""
     run = motion_run(home)
     weights, log, results = run.model.read_bytes(), run.metrics_path.read_bytes(), run.results
-    stages = [path.name for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
+    count = len(stages(run))
     ik = ("evaluation.ik=lbfgs", "evaluation.ik_iterations=1")
     assert "evaluation done" in command(home, "eval", run.id, *ik)
-    assert "finished already" in command(home, "train", *TINY, INT8, *seed_of(run), *ik)
-    said = command(home, "eval", run.id, "export.precision=fp32")
+    assert "finished already" in command(home, "train", *TINY, INT8, *ik)
+    with monkeypatch.context() as patch:  # the same graph as that of int8
+        patch.setattr("memmlp.deploy.export.export", lambda model, path, *_: shutil.copy(run.onnx, path))
+        said = command(home, "eval", run.id, "export.precision=fp32")
     assert "deployment done" in said
     assert "evaluation" not in said
     both = ("memory.blend=1", "export.precision=fp32", "export.graph=naive")
@@ -132,20 +134,13 @@ def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
     now = Run(run.folder).results
     assert set(now["stream"]) == {*results["stream"], "combined"}
     assert now["stream"]["rotation"] == results["stream"]["rotation"]  # of m = 0.5, and not of the last one
-    made = [path.name for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
-    assert len(made) == len(stages) + 2 + 1 + 3
-
-
-def seed_of(run: Run) -> list[str]:
-    """Return the overrides that give a command line this run's seeds."""
-    return [f"seed={run.config['seed']}", f"vqvae.seed={run.config['vqvae']['seed']}"]
+    assert len(stages(run)) == count + 2 + 1 + 3
 
 
 def test_a_nan_is_not_exported(home, memmlp, monkeypatch):
     monkeypatch.chdir(home)
-    monkeypatch.setattr(
-        "memmlp.deploy.parity.measure_differences", lambda *_: torch.tensor([1e-6, float("nan")])
-    )
+    apart = torch.tensor([1e-6, float("nan")])
+    monkeypatch.setattr("memmlp.deploy.parity.measure_differences", lambda *_: apart)
     monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run, opset: path.write_bytes(b""))
     monkeypatch.setattr(MotionDataset, "read_clips", lambda self: [torch.zeros(2, 252)])
     ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--opset", "17")
@@ -187,22 +182,15 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
     assert torch.isfinite(model.stem.weight).all()
 
 
-@pytest.fixture
-def begun(tmp_path: Path) -> tuple[Any, Run]:
-    """What an experiment's outcome is recorded with, and a run that has begun."""
-    run = Run.from_id(tmp_path, "0" * 16)
-    run.begin("memmlp", {}, data="d", prerequisite=None)
-    return SimpleNamespace(loggers=Loggers((), tmp_path), stage_ids=(), outputs=tmp_path), run
-
-
 @pytest.mark.parametrize(("error", "failure"), [
     (TrainingDiverged("loss is nan"), "loss is nan"), (OSError(5, "bad disk"), "bad disk"),
     (OSError(28, "disk full"), None), (BrokenPipeError(32, "nobody reads"), None),
     (LeaseLost("taken over"), None), (InputError("data changed"), None),
     (Cancelled("by its plan"), None), (KeyboardInterrupt(), None),
 ])  # fmt: skip
-def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(begun, error, failure):
-    experiment, run = begun
+def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(tmp_path, error, failure):
+    run = begun(tmp_path)
+    experiment: Any = SimpleNamespace(loggers=Loggers((), tmp_path), stage_ids=(), outputs=tmp_path)
     with pytest.raises(type(error)), record_outcome(experiment, run):
         raise error
     assert (run.failure is None) == (failure is None)
@@ -219,15 +207,13 @@ def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: p
         evaluations = {"stream": "stream-0", "window": "window-0"}
         experiment: Any = SimpleNamespace(config={"plugins": ["mine"]}, evaluations=evaluations)
         made = {"mean": {}, "clips": [], **run_stages.describe_user_code(experiment)}
-        write_report(
-            run.evaluation("stream-0"), made | {"mode": "stream", "settings": {"metrics": {"a": "mine.a"}}}
-        )
-        assert run_stages.list_missing_modes(experiment, run) == ["window"]
+        missing = partial(run_stages.list_missing_modes, experiment, run)
+        own = made | {"mode": "stream", "settings": {"metrics": {"a": "mine.a"}}}
+        write_report(run.evaluation("stream-0"), own)
+        assert missing() == ["window"]
         write_report(run.evaluation("window-0"), made | {"mode": "window", "settings": {}})
-        assert run_stages.list_missing_modes(experiment, run) == []
+        assert missing() == []
         code.write_text("A = 2\n")
-        assert (
-            run_stages.list_missing_modes(experiment, run) == []
-        )  # this process would measure them as before
+        assert missing() == []  # this process would measure them as before
         environment._read_user_code.cache_clear()
-        assert run_stages.list_missing_modes(experiment, run) == ["stream"]
+        assert missing() == ["stream"]

@@ -1,7 +1,5 @@
 """SAGE-Net by one command: a run for each part, each upon the one before, and the whole upon the last."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

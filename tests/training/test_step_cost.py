@@ -1,7 +1,5 @@
 """The products of a training step are those that torch counts, and its time includes them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tiny_tasks import OPTIM, motion_task, recurrent_task

@@ -1,7 +1,5 @@
 """Training of a refiner behind a finished network."""
 
-from __future__ import annotations
-
 import pytest
 import tiny
 import torch
@@ -18,10 +16,8 @@ REFINER = SAGERefinerSettings(width=6, depth=2, frames=20, pieces=6)
 
 def task(optim: Optim = OPTIM) -> RefinerTask:
     dataset, model = tiny.frames(), tiny.refined(tiny.baseline("avatar_poser"))
-    training = RefinerTraining(0, REFINER, optim, "frames")
-    return RefinerTask(
-        model, SAGERefinerLoss(), dataset, training.draw_pieces(dataset), optim, validate=lambda: {}
-    )
+    pieces = RefinerTraining(0, REFINER, optim, "frames").draw_pieces(dataset)
+    return RefinerTask(model, SAGERefinerLoss(), dataset, pieces, optim, validate=lambda: {})
 
 
 def test_pieces_are_of_the_training_clips_and_the_network_streams_through_each():
@@ -30,9 +26,8 @@ def test_pieces_are_of_the_training_clips_and_the_network_streams_through_each()
     for piece, clip, motion in zip(one.frames, one.clips, one.streamed, strict=True):
         known = dataset.read_clip(int(clip)).unfold(0, 20, 1).transpose(1, 2)
         assert (known == piece).flatten(1).all(1).any()
-        torch.testing.assert_close(
-            motion, modes.predict_stream(one.model.network, [piece])[0], atol=1e-5, rtol=0
-        )
+        (expected,) = modes.predict_stream(one.model.network, [piece])
+        torch.testing.assert_close(motion, expected, atol=1e-5, rtol=0)
 
 
 def test_a_step_compares_the_corrected_pieces_and_reaches_the_refiner_alone():
@@ -45,24 +40,18 @@ def test_a_step_compares_the_corrected_pieces_and_reaches_the_refiner_alone():
     assert slopes == {f"{part}.{name}" for part, weights in parts for name, _ in weights}
     torch.manual_seed(3)
     drawn = torch.randint(6, (4,))
-    motion = modes.predict_stream(one.model, list(one.frames[drawn]))
     true = one.frames[drawn]
-    terms = one.loss.terms(
-        torch.stack(motion), true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], one.model.normalizer
-    )
+    motion = torch.stack(modes.predict_stream(one.model, list(true)))
+    given = motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], one.model.normalizer
+    terms = one.loss.terms(*given)
     found = {name: float(term.detach()) for name, term in result.terms.items()}
     assert found == pytest.approx({name: float(term) for name, term in terms.items()}, rel=1e-3)
     assert torch.equal(one.clips[drawn], result.clips)
 
 
 def test_the_network_streams_without_gradients_and_without_dropout():
-    model = tiny.baseline("avatar_poser").train()
-    pieces, clips = torch.stack([tiny.clip(12, seed) for seed in (1, 2)]), torch.tensor([0, 1])
-    made = [
-        RefinerTask(
-            tiny.refined(model), SAGERefinerLoss(), tiny.frames(), (pieces, clips), OPTIM, dict
-        ).streamed
-        for _ in range(2)
-    ]
+    model = tiny.refined(tiny.baseline("avatar_poser").train())
+    given = (torch.stack([tiny.clip(12, seed) for seed in (1, 2)]), torch.tensor([0, 1])), OPTIM, dict
+    made = [RefinerTask(model, SAGERefinerLoss(), tiny.frames(), *given).streamed for _ in range(2)]
     assert not made[0].requires_grad
     torch.testing.assert_close(made[0], made[1])

@@ -1,10 +1,8 @@
 """How SAGE-Net's parts are trained: on their half alone, beside parts that stay as they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import tiny
@@ -62,23 +60,12 @@ def test_a_true_pose_has_no_error_and_hands_are_where_the_trackers_are():
     assert float(found["hand"]) == pytest.approx(0, abs=1e-6)
 
 
-class Watched:
-    """Calls a function and keeps the arguments it was called with."""
-
-    def __init__(self, function):
-        self.function, self.calls = function, []
-
-    def __call__(self, *arguments):
-        self.calls.append(arguments)
-        return self.function(*arguments)
-
-
 def test_joints_are_hidden_in_training_alone_and_never_the_first():
     net, codes = parts("upper_codes")
-    codes.encode = Watched(codes.encode)
+    codes.encode = mock.Mock(side_effect=codes.encode)
     for training in (True, False):
         train_sage.compute_code_losses(net, codes, FRAMES, training)
-    seen = [rotation.unflatten(-1, (N_JOINTS, 6)) for rotation, _ in codes.encode.calls]
+    seen = [rotation.unflatten(-1, (N_JOINTS, 6)) for (rotation, _), _ in codes.encode.call_args_list]
     hidden, shown = ((one == train_sage.HIDDEN).all(-1) for one in seen)
     assert not shown.any()
     assert not hidden[..., 0].any()
@@ -87,16 +74,12 @@ def test_joints_are_hidden_in_training_alone_and_never_the_first():
     assert (train_sage.add_noise(net, torch.zeros(99, 4, 384))[2].sum(1) <= 2).all()
 
 
-def every_tensor(*modules: nn.Module) -> dict[str, torch.Tensor]:
-    return {f"{i}.{name}": t for i, module in enumerate(modules) for name, t in module.state_dict().items()}
-
-
 @pytest.mark.parametrize("kind", PARTS[:-1])
 def test_a_step_changes_the_part_and_nothing_else(kind):
     for precision in ("fp32", "bf16"):
         optim = replace(OPTIM, precision=precision)
         task = part_task(kind, optim)
-        tensors = every_tensor(*task.objective.args)
+        tensors = nn.ModuleList(task.objective.args).state_dict()
         before = {name: tensor.clone() for name, tensor in tensors.items()}
         train_step(task, optim, optim.build(task.parameter_groups()), 0)
         own = {tensor.data_ptr() for tensor in task.module.state_dict().values()}
@@ -111,28 +94,24 @@ def test_the_upper_half_is_validated_on_what_it_samples():
     """Not on one step of denoising, whose error depends on the noise that was drawn."""
     net, codes = parts("upper_diffusion")
     rotation, encoded = train_sage.encode_windows(net, FRAMES)
-    error = net.sample_upper(encoded) - train_sage.encode_latents(codes, rotation, encoded)
-    expected = nn.functional.smooth_l1_loss(error, torch.zeros_like(error))
-    assert torch.equal(
-        train_sage.compute_latent_losses(net, codes, FRAMES, False, lower=False)["latent"], expected
-    )
-    assert not torch.equal(
-        train_sage.compute_latent_losses(net, codes, FRAMES, True, lower=False)["latent"], expected
-    )
+    sampled, true = net.sample_upper(encoded), train_sage.encode_latents(codes, rotation, encoded)
+    for training in (False, True):
+        found = train_sage.compute_latent_losses(net, codes, FRAMES, training, lower=False)["latent"]
+        assert torch.equal(found, nn.functional.smooth_l1_loss(sampled, true)) != training
 
 
 def test_the_lower_half_is_given_what_the_upper_one_samples():
     """Never the true latents, which there are none of at inference."""
     net, codes = parts("lower_diffusion")
     encoded = net.normalizer.encode(FRAMES)[..., :SPARSE_DIM]
-    net.lower.merge_latents = Watched(net.lower.merge_latents)
+    net.lower.merge_latents = mock.Mock(side_effect=net.lower.merge_latents)
     with torch.no_grad():
         for training in (True, False):
             train_sage.compute_latent_losses(net, codes, FRAMES, training, lower=True)
         net.predict_rotations(encoded)
         expected = net.sample_upper(encoded)
-    assert len(net.lower.merge_latents.calls) == 1 + 2 * len(net.diffusion.times)
-    assert all(torch.equal(upper, expected) for _, upper in net.lower.merge_latents.calls)
+    assert len(net.lower.merge_latents.call_args_list) == 1 + 2 * len(net.diffusion.times)
+    assert all(torch.equal(upper, expected) for (_, upper), _ in net.lower.merge_latents.call_args_list)
 
 
 def test_the_whole_is_trained_through_both_samplers():
@@ -145,18 +124,14 @@ def test_the_whole_is_trained_through_both_samplers():
 
 
 def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
-    kept = tiny.baseline("sage", seed=1)
+    kept, parts = tiny.baseline("sage", seed=1), ("upper", "lower", "decoder")
     checkpoint.write(tmp_path / "model", checkpoint.collect_module_tensors("model", kept), {})
-    network = partial(tiny.build_baseline, "sage")
-    architecture = Architecture(
-        World(), normalize=False, vqvae=tiny.vqvae, network=lambda *of: network(of[0])
-    )
+    build = lambda normalizer, *_: tiny.build_baseline("sage", normalizer)  # noqa: E731
+    architecture = Architecture(World(), normalize=False, vqvae=tiny.vqvae, network=build)
     for finished in ((), ("upper", "lower")):
-        net = replace(architecture, trained_parts=finished).build_for_training(
-            tiny.normalizer(), tmp_path / "model"
-        )
-        stems = {name: net.get_submodule(name).stem.weight for name in ("upper", "lower", "decoder")}
-        known = {name: kept.get_submodule(name).stem.weight for name in stems}
+        architecture = replace(architecture, trained_parts=finished)
+        net = architecture.build_for_training(tiny.normalizer(), tmp_path / "model")
+        stems, known = ({name: one.get_submodule(name).stem.weight for name in parts} for one in (net, kept))
         same = {name for name, stem in stems.items() if torch.equal(stem, known[name])}
         assert same == (set(finished) or set(stems))
         assert {name for name, stem in stems.items() if not stem.requires_grad} == set(finished)

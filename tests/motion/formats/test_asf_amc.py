@@ -1,14 +1,12 @@
 """ASF/AMC files: kinematics against plain NumPy, the databases' quirks, and damaged files."""
 
-from __future__ import annotations
-
 import re
-import tarfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from asf_samples import DOFS, amc_text, asf_text, movement, plain_positions, write_take
+from asf_samples import COLUMNS, amc_text, asf_text, movement, plain_positions, write_take
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
@@ -19,20 +17,11 @@ from memmlp.motion.geometry import compute_clip_kinematics
 from memmlp.motion.importing.fidelity import Fidelity
 from memmlp.motion.importing.import_folder import import_folder, verify_folder
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
 CUTS = {
     "32_01": 120, "32_02": 120, "35_02": 20, "35_05": 10, "35_09": 10, "35_10": 10, "35_11": 16, "35_12": 20,
     "35_13": 80, "35_30": 160, "38_02": 50, "39_08": 30, "39_12": 30, "55_04": 150,
 }  # fmt: skip
 """Takes that were cut at the start -> the number of their first frame, by the data's README."""
-
-
-def assert_posed(take: Path, asf: Path) -> None:
-    """All joints are where plain NumPy puts them."""
-    recording, expected = read_amc(take), plain_positions(asf, take)
-    positions = recording.compute_kinematics()[1]
-    for node, name in enumerate(recording.nodes):
-        assert np.abs(positions[:, node] - expected[name]).max() < 1e-6, name
 
 
 def assert_imported(source: Path, out: Path) -> None:
@@ -55,9 +44,8 @@ def test_head_and_soles_of_a_person_who_stands_are_level(tmp_path: Path):
     """In the zero pose the head leans back, and the legs are spread by 20 degrees together with the feet."""
     values = np.zeros((2, 62))
     values[:, 1] = 17.0
-    columns = [name for name, dofs in DOFS.items() for _ in dofs]
-    values[:, columns.index("head")] = 16.0
-    values[:, columns.index("lfemur") + 2], values[:, columns.index("rfemur") + 2] = -20.0, 20.0
+    for bone, dof, degrees in (("head", "rx", 16.0), ("lfemur", "rz", -20.0), ("rfemur", "rz", 20.0)):
+        values[:, COLUMNS.index((bone, dof))] = degrees
     write_take(tmp_path / "05", values)
     import_folder(tmp_path / "05", tmp_path / "out")
     clip = read_clip(tmp_path / "out" / "05_01.npz", "05_01")
@@ -67,19 +55,18 @@ def test_head_and_soles_of_a_person_who_stands_are_level(tmp_path: Path):
 
 
 def test_joints_are_where_plain_kinematics_puts_them(tmp_path: Path):
-    take = write_take(tmp_path / "05", movement(12, size=60.0))
-    assert_posed(take, tmp_path / "05" / "05.asf")
-    recording = read_amc(take)
+    values = movement(12, size=60.0).round(3)  # as far as a take has digits
+    recording, expected = read_amc(write_take(tmp_path / "05", values)), plain_positions(values)
+    zero, positions = plain_positions(0 * values[:1]), recording.compute_kinematics()[1]
     assert recording.fps is None
-    zero = plain_positions(tmp_path / "05" / "05.asf", write_take(tmp_path / "05", np.zeros((1, 62))))
-    for name, position in zip(recording.nodes, recording.compute_zero_pose(), strict=True):
-        assert np.allclose(position, zero[name][0], atol=1e-9), name
+    for node, name in enumerate(recording.nodes):
+        np.testing.assert_allclose(positions[:, node], expected[name], atol=1e-6)
+        np.testing.assert_allclose(recording.compute_zero_pose()[node], zero[name][0], atol=1e-9)
 
 
 def test_a_pose_has_the_given_angles(tmp_path: Path):
     values = np.zeros((1, 62))
-    columns = [name for name, dofs in DOFS.items() for _ in dofs]
-    values[0, columns.index("lhumerus") + 1] = 35.0
+    values[0, COLUMNS.index(("lhumerus", "ry"))] = 35.0
     recording = read_amc(write_take(tmp_path / "05", values))
     posed, frames = recording.compute_pose({"lhumerus": [0.0, 35.0, 0.0]}), recording.compute_kinematics()
     for one, other in zip(posed, frames, strict=True):
@@ -111,62 +98,48 @@ def test_the_skeleton_is_that_of_the_same_name(tmp_path: Path):
         read_amc(take)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("angle deg", "angle rad", "line 7: angle rad; expected angle deg"),
-        ("length 0.45", "length 0", "line 6: length 0; expected a factor above 0"),
-        (":bonedata", ":bones", "no :bonedata"),
-        ("direction 0 0 1", "direction 0 zero 1", "direction 0 zero 1; expected 3 numbers"),
-        ("     length 7.1\n", "", "a bone without length ends here"),
-        ("dof rx ry rz", "dof rx ry l", "rx ry l; expected one or more of rx ry rz"),
-        ("axis 0 0 20  XYZ", "axis 0 0 20", "axis 0 0 20; expected an order of axes"),
-        ("    ltibia lfoot\n", "", "lfoot; expected root, or a bone that is a child in an earlier line"),
-        ("lfoot ltoes", "lfoot", "ltoes is missing in :hierarchy"),
-        ("name ltibia", "name lfemur", "a second bone lfemur"),
-        ("position 0 0 0", "position 0 1 0", "position 0 1 0; expected 0 0 0"),
-        ("  end\n:hierarchy", ":hierarchy", "the last bone of :bonedata has no end"),
-        (":version", "version", "version; expected a section"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ("angle deg", "angle rad", "line 7: angle rad; expected angle deg"),
+    ("length 0.45", "length 0", "line 6: length 0; expected a factor above 0"),
+    (":bonedata", ":bones", "no :bonedata"),
+    ("direction 0 0 1", "direction 0 zero 1", "direction 0 zero 1; expected 3 numbers"),
+    ("     length 7.1\n", "", "a bone without length ends here"),
+    ("dof rx ry rz", "dof rx ry l", "rx ry l; expected one or more of rx ry rz"),
+    ("axis 0 0 20  XYZ", "axis 0 0 20", "axis 0 0 20; expected an order of axes"),
+    ("    ltibia lfoot\n", "", "lfoot; expected root, or a bone that is a child in an earlier line"),
+    ("lfoot ltoes", "lfoot", "ltoes is missing in :hierarchy"),
+    ("name ltibia", "name lfemur", "a second bone lfemur"),
+    ("position 0 0 0", "position 0 1 0", "position 0 1 0; expected 0 0 0"),
+    ("  end\n:hierarchy", ":hierarchy", "the last bone of :bonedata has no end"),
+    (":version", "version", "version; expected a section"),
+])  # fmt: skip
 def test_damaged_skeletons_are_one_line(tmp_path: Path, old: str, new: str, said: str):
-    take = write_take(tmp_path / "05", movement(1))
+    take, asf = write_take(tmp_path / "05", movement(1)), tmp_path / "05" / "05.asf"
     assert old in asf_text()
-    (tmp_path / "05" / "05.asf").write_text(asf_text().replace(old, new, 1), encoding="latin-1")
-    with pytest.raises(InputError, match=re.escape(said)) as error:
+    asf.write_text(asf_text().replace(old, new, 1), encoding="latin-1")
+    with pytest.raises(InputError, match=rf"^{asf}: .*{re.escape(said)}.*\Z"):
         read_amc(take)
-    assert str(error.value).startswith(f"{tmp_path / '05' / '05.asf'}: ")
-    assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        (r"\nltoes .*", "", "frame 1 without ltoes"),
-        (r"\n2\n", "\n3\n", "frame 3 after frame 1; expected frame 2"),
-        (r"\nrfoot \S+", "\nrfoot", "rfoot "),
-        (r"\nlowerback \S+", "\nlowerback x", "lowerback x"),
-        (r"\nlowerback \S+", "\nlowerback nan", "lowerback nan"),
-        (r"\nlradius ", "\nlelbow ", "lelbow; expected a bone with angles, at most once per frame"),
-        (
-            r"\n(ltibia .*)",
-            r"\n\1\n\1",
-            "ltibia; expected a bone with angles, at most once per frame",
-        ),
-        (r"(?s)\n1\n.*", "\n", "no frames"),
-        (r":DEGREES", ":RADIANS", "line 3: :RADIANS; expected frames in degrees"),
-        (r"\n1\n", "\n", "line 4: root; expected a frame number"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "said"), [
+    (r"\nltoes .*", "", "frame 1 without ltoes"),
+    (r"\n2\n", "\n3\n", "frame 3 after frame 1; expected frame 2"),
+    (r"\nrfoot \S+", "\nrfoot", "rfoot "),
+    (r"\nlowerback \S+", "\nlowerback x", "lowerback x"),
+    (r"\nlowerback \S+", "\nlowerback nan", "lowerback nan"),
+    (r"\nlradius ", "\nlelbow ", "lelbow; expected a bone with angles, at most once per frame"),
+    (r"\n(ltibia .*)", r"\n\1\n\1", "ltibia; expected a bone with angles, at most once per frame"),
+    (r"(?s)\n1\n.*", "\n", "no frames"),
+    (r":DEGREES", ":RADIANS", "line 3: :RADIANS; expected frames in degrees"),
+    (r"\n1\n", "\n", "line 4: root; expected a frame number"),
+])  # fmt: skip
 def test_damaged_takes_are_one_line(tmp_path: Path, old: str, new: str, said: str):
     take = write_take(tmp_path / "05", movement(2))
     text, changes = re.subn(old, new, amc_text(movement(2)), count=1)
     assert changes == 1
     take.write_text(text, encoding="latin-1")
-    with pytest.raises(InputError, match=re.escape(said)) as error:
+    with pytest.raises(InputError, match=rf"^{take}: .*{re.escape(said)}.*\Z"):
         read_amc(take)
-    assert str(error.value).startswith(f"{take}: ")
-    assert "\n" not in str(error.value)
 
 
 def test_a_take_may_end_anywhere(tmp_path: Path):
@@ -178,54 +151,36 @@ def test_a_take_may_end_anywhere(tmp_path: Path):
             read_amc(take)
 
 
-# The databases themselves
-
-
-@pytest.fixture(scope="module", params=["cmu-asfamc", "hdm05-asfamc"])
-def database(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    archive = DATA / request.param / f"{request.param}.tar.xz"
-    if not archive.is_file():
-        pytest.skip(f"needs {archive.name}, which is not part of the project")
-    folder = tmp_path_factory.mktemp(request.param)
-    with tarfile.open(archive) as file:
-        file.extractall(folder, filter="data")
-    return folder
-
-
 @pytest.mark.slow
-def test_the_databases_have_the_takes_and_cuts_of_their_readmes(database: Path, tmp_path: Path):
-    starts = {take.stem: first_frame(take) for take in database.rglob("*.amc")}
-    cuts = {take: first for take, first in starts.items() if first != 1}
-    assert (len(starts), cuts) in ((142, CUTS), (233, {}))
-    shortest: dict[Path, Path] = {}  # of each person
-    for take in sorted(database.rglob("*.amc"), key=lambda take: take.stat().st_size):
-        shortest.setdefault(take.parent, take)
-    for person, take in list(shortest.items())[:2]:
-        (asf,) = person.glob("*.asf")
-        assert read_amc(take).first_frame == starts[take.stem]
-        assert_posed(take, asf)
-        for file in (take, asf):
-            (tmp_path / "in" / person.name).mkdir(parents=True, exist_ok=True)
-            (tmp_path / "in" / person.name / file.name).symlink_to(file)
+@pytest.mark.parametrize(("name", "takes", "cuts"), [("cmu-asfamc", 142, CUTS), ("hdm05-asfamc", 233, {})])
+def test_the_databases_have_the_takes_and_cuts_of_their_readmes(
+    database: Callable[[str], Path], tmp_path: Path, name: str, takes: int, cuts: dict[str, int]
+):
+    paths = sorted(database(name).rglob("*.amc"), key=lambda take: take.stat().st_size)
+    starts = {take.stem: first_frame(take) for take in paths}
+    assert (len(starts), {take: first for take, first in starts.items() if first != 1}) == (takes, cuts)
+    assert read_amc(paths[0]).first_frame == starts[paths[0].stem]
+    for file in (paths[0], *paths[0].parent.glob("*.asf")):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        (tmp_path / "in" / file.name).symlink_to(file)
     assert_imported(tmp_path / "in", tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_two_forms_of_a_take_are_one_body(database: Path, tmp_path: Path):
+def test_two_forms_of_a_take_are_one_body(database: Callable[[str], Path], tmp_path: Path):
     """ASF/AMC and the MotionBuilder conversion, which has no length between thorax and neck."""
-    archive = DATA / "cmu-bvh" / "cmu-motionbuilder.tar.xz"
-    take = next(database.rglob("05_06.amc"), None)
-    if not archive.is_file() or take is None:
-        pytest.skip("needs subject 05 of CMU's database in both forms")
-    with tarfile.open(archive) as file:
-        file.extract("cmu-motionbuilder/05/05_06.bvh", tmp_path, filter="data")
-    import_folder(tmp_path / "cmu-motionbuilder" / "05" / "05_06.bvh", tmp_path / "one")
-    import_folder(take, tmp_path / "other")
-    one, other = (read_clip(tmp_path / side / "05_06.npz", "clip") for side in ("one", "other"))
-    one_at, other_at = (compute_clip_kinematics(c, make_builtin_rest_joints())[0] for c in (one, other))
-    turns = Rotation.from_matrix((one_at.swapaxes(-1, -2) @ other_at).reshape(-1, 3, 3))
+    takes = (
+        database("cmu-motionbuilder") / "cmu-motionbuilder/05/05_06.bvh",
+        database("cmu-asfamc") / "cmu-asfamc/05/05_06.amc",
+    )
+    clips = []
+    for take in takes:
+        import_folder(take, tmp_path / take.suffix)
+        clips.append(read_clip(tmp_path / take.suffix / "05_06.npz", "clip"))
+    one, other = (compute_clip_kinematics(clip, make_builtin_rest_joints())[0] for clip in clips)
+    turns = Rotation.from_matrix((one.swapaxes(-1, -2) @ other).reshape(-1, 3, 3))
     angles = np.degrees(turns.magnitude()).reshape(len(one), -1)
-    assert angles[:, [joint for joint in range(22) if JOINTS[joint] != "spine3"]].max() < 3
+    assert np.delete(angles, JOINTS.index("spine3"), 1).max() < 3
 
 
 def first_frame(take: Path) -> int:

@@ -5,6 +5,7 @@ import pickle
 import tracemalloc
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,7 +56,7 @@ def parted(root: str, body: str, trans: str, width: int) -> dict[str, np.ndarray
     return parts | {"mocap_frame_rate": np.array(120.0)}
 
 
-def test_every_layout_gives_the_same_clip(tmp_path, monkeypatch):
+def test_every_layout_gives_the_same_clip_and_parts_of_another_size_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(bounded_npz, "BLOCK", 15_000)  # several blocks an array
     for values in (
         parted("root_orient", "pose_body", "trans", 63), parted("global_orient", "body_pose", "transl", 63),
@@ -69,13 +70,10 @@ def test_every_layout_gives_the_same_clip(tmp_path, monkeypatch):
         clip = read_clip(tmp_path / "a.npz", "a")
         np.testing.assert_array_equal(clip.poses.reshape(20, 66), arrays()["poses"][:, :66])
         np.testing.assert_array_equal(clip.trans, arrays()["trans"])
-
-
-def test_parts_of_another_size_are_refused(tmp_path):
     path = tmp_path / "a.npz"
     good = parted("root_orient", "pose_body", "trans", 63)
-    for change in ({"pose_body": good["pose_body"][:, :60]}, {"root_orient": good["pose_body"]},
-                   {"root_orient": good["root_orient"][:5]}):  # fmt: skip
+    root, body = good["root_orient"], good["pose_body"]
+    for change in ({"pose_body": body[:, :60]}, {"root_orient": body}, {"root_orient": root[:5]}):
         path.write_bytes(npz(**(good | change)))
         with pytest.raises(InputError, match=r"a\.npz: .*(root_orient|pose_body)"):
             read_clip(path, "a")
@@ -105,26 +103,21 @@ def test_pickles_are_refused_and_never_run(tmp_path):
 def structural() -> list[bytes]:
     """Sound zip files with wrong content."""
     good = arrays()
-    wrong: list[dict[str, object]] = [
-        {"poses": good["poses"][:, :60]}, {"poses": np.zeros((20, 88))},
-        {"poses": good["poses"][0]}, {"poses": good["poses"].astype(int)},
-        {"poses": good["poses"][:0], "trans": good["trans"][:0]}, {"poses": np.full((20, 156), np.nan)},
-        {"poses": np.full((20, 156), np.inf)}, {"poses": good["poses"] * 1e6}, {"trans": good["trans"][:5]},
-        {"trans": good["trans"] * np.nan}, {"trans": good["trans"][:, :2]}, {"trans": np.array("a")},
-        {"trans": good["trans"] + 1e9}, {"mocap_framerate": np.array(0.0)},
-        {"mocap_framerate": np.array(-60.0)},
-        {"mocap_framerate": np.array(np.nan)}, {"mocap_framerate": np.array("fast")},
-        {"mocap_framerate": np.array([])}, {"mocap_framerate": np.array(1e9)},
-        {"poses": np.zeros((20, 156), complex)},
-        {"mocap_framerate": np.array([None], dtype=object)},
-    ]  # fmt: skip
-    files = [npz(**(good | change)) for change in wrong]
-    files += [
-        npz(**{k: v for k, v in good.items() if k != gone}) for gone in ("poses", "trans", "mocap_framerate")
-    ]
-    one = good["poses"].copy()
+    poses, trans = good["poses"], good["trans"]
+    one = poses.copy()
     one[7, 3] = np.nan
-    return [*files, npz(**(good | {"poses": one})), b"", b"PK\x03\x04", b"not a zip at all", npz()]
+    wrong: dict[str, list[Any]] = {
+        "poses": [
+            poses[:, :60], np.zeros((20, 88)), poses[0], poses.astype(int), np.full((20, 156), np.nan), one,
+            np.full((20, 156), np.inf), poses * 1e6, np.zeros((20, 156), complex),
+        ],
+        "trans": [trans[:5], trans * np.nan, trans[:, :2], np.array("a"), trans + 1e9],
+        "mocap_framerate": [0.0, -60.0, np.nan, "fast", [], 1e9, np.array([None], dtype=object)],
+    }  # fmt: skip
+    files = [npz(**(good | {key: np.array(bad)})) for key, values in wrong.items() for bad in values]
+    files += [npz(**{key: value for key, value in good.items() if key != gone}) for gone in wrong]
+    empty = npz(**(good | {"poses": poses[:0], "trans": trans[:0]}))
+    return [*files, empty, b"", b"PK\x03\x04", b"not a zip at all", npz()]
 
 
 def huge_header() -> bytes:
@@ -133,9 +126,8 @@ def huge_header() -> bytes:
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999, 156), }"
     block = b"\x93NUMPY\x01\x00" + len(header + b"\n").to_bytes(2, "little") + header + b"\n"
     with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr("poses.npy", block)
-        archive.writestr("trans.npy", block)
-        archive.writestr("mocap_framerate.npy", block)
+        for name in ("poses", "trans", "mocap_framerate"):
+            archive.writestr(f"{name}.npy", block)
     return buffer.getvalue()
 
 
@@ -143,42 +135,27 @@ def test_wrong_content_is_one_line(tmp_path):
     path = tmp_path / "bad.npz"
     for content in (*structural(), huge_header()):
         path.write_bytes(content)
-        with pytest.raises(InputError) as caught:
+        with pytest.raises(InputError, match=rf"^{path}.*\Z"):
             read_clip(path, "bad")
-        assert str(path) in str(caught.value)
-        assert "\n" not in str(caught.value)
-
-
-def repacked(data: bytes, **entries: bytes) -> bytes:
-    """The npz with the bytes of some entries replaced."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
-        for name in old.namelist():
-            new.writestr(name, entries.get(name.removesuffix(".npy"), old.read(name)))
-    return buffer.getvalue()
-
-
-def entry(name: str) -> bytes:
-    with zipfile.ZipFile(io.BytesIO(npz(**arrays()))) as packed:
-        return packed.read(f"{name}.npy")
 
 
 def test_damaged_entries_are_one_line(tmp_path):
+    whole = npz(**arrays())
+    with zipfile.ZipFile(io.BytesIO(whole)) as packed:
+        entries = {name: packed.read(name) for name in packed.namelist()}
+    sound = entries["poses.npy"]
     for poses in (
-        npz(**arrays()),  # the entry is itself a zip
-        entry("poses").replace(b"(20, 156)", b"(20, 156 "),  # tokenize.TokenError
-        entry("poses").replace(b"'<f8'", b"'|O8'"),
-        entry("poses").replace(b"(20, 156)", b"(-2,-156)"),
-        entry("poses").replace(b"(20, 156)", b"(21, 156)"),
-        b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535,
-        b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + bytes(20),
-        b"\x93NUMPY\x03\x00" + entry("poses")[8:],
-        b"",
-    ):
-        (tmp_path / "a.npz").write_bytes(repacked(npz(**arrays()), poses=poses))
-        with pytest.raises(InputError, match=r"a\.npz: .*(poses|cannot be read)") as caught:
+        whole,  # the entry is itself a zip
+        sound.replace(b"(20, 156)", b"(20, 156 "),  # tokenize.TokenError
+        sound.replace(b"'<f8'", b"'|O8'"), sound.replace(b"(20, 156)", b"(-2,-156)"),
+        sound.replace(b"(20, 156)", b"(21, 156)"), b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535,
+        b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + bytes(20), b"\x93NUMPY\x03\x00" + sound[8:], b"",
+    ):  # fmt: skip
+        with zipfile.ZipFile(tmp_path / "a.npz", "w") as new:
+            for name, content in (entries | {"poses.npy": poses}).items():
+                new.writestr(name, content)
+        with pytest.raises(InputError, match=r"\A.*a\.npz: .*(poses|cannot be read).*\Z"):
             read_clip(tmp_path / "a.npz", "a")
-        assert "\n" not in str(caught.value)
 
 
 def peak_of_refusal(path: Path, match: str) -> int:
@@ -192,7 +169,7 @@ def peak_of_refusal(path: Path, match: str) -> int:
         tracemalloc.stop()
 
 
-def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(tmp_path, monkeypatch):
+def test_files_that_unpack_to_much_are_refused_before_they_do(tmp_path, monkeypatch):
     """It says so itself; the bound is lowered, so that the test need not pack gigabytes."""
     monkeypatch.setattr(bounded_npz, "MAX_ROWS", 500)
     path = tmp_path / "a.npz"
@@ -200,9 +177,6 @@ def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(tmp_path, m
         np.savez_compressed(path, **(arrays() | {"poses": np.zeros(shape)}))
         assert path.stat().st_size < 100_000
         assert peak_of_refusal(path, f"poses has type and shape float64 .*{allowed}") < 500_000
-
-
-def test_a_file_that_unpacks_to_more_than_it_says_is_refused(tmp_path):
     path, honest = tmp_path / "a.npz", io.BytesIO()
     np.savez_compressed(honest, **(arrays() | {"poses": np.zeros((5000, 156))}))
     data = honest.getvalue()

@@ -1,7 +1,5 @@
 """Proposed maps: limbs by names, the trunk by the tree, and their YAML."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -19,11 +17,6 @@ from memmlp.motion.importing.guess import (
 from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
 
 
-@pytest.fixture(params=["bandai_namco", "cmu_daz", "cmu_motionbuilder", "mixamo", "smpl", "smpl_words"])
-def name(request: pytest.FixtureRequest) -> str:
-    return request.param
-
-
 def walks(folder: Path, name: str, turned: bool = False) -> Bvh:
     return read_bvh(write(folder, walking(name, turned).text()))
 
@@ -38,6 +31,9 @@ def test_words():
         assert split_node_name(name) == (side, word)
 
 
+@pytest.mark.parametrize(
+    "name", ["bandai_namco", "cmu_daz", "cmu_motionbuilder", "mixamo", "smpl", "smpl_words"]
+)
 def test_the_shipped_map_is_guessed_and_written(tmp_path: Path, name: str):
     bvh = walks(tmp_path, name)
     proposed = guess_map(bvh, "on: 1")
@@ -51,24 +47,21 @@ def test_the_shipped_map_is_guessed_and_written(tmp_path: Path, name: str):
 
 
 WRISTS = {"cmu_motionbuilder": {"left_wrist": "LeftHand", "right_wrist": "RightHand"}}  # by their names
-HDM = {  # names of joints in ASF files, as in HDM05 and CMU's database
-    "Hips": "root", "LHipJoint": "lhipjoint", "LeftUpLeg": "lfemur", "LeftLeg": "ltibia", "LeftFoot": "lfoot",
-    "LeftToeBase": "ltoes", "RHipJoint": "rhipjoint", "RightUpLeg": "rfemur", "RightLeg": "rtibia",
-    "RightFoot": "rfoot", "RightToeBase": "rtoes", "LowerBack": "lowerback", "Spine": "upperback",
-    "Spine1": "thorax", "Neck": "lowerneck", "Neck1": "upperneck", "Head": "head",
-    "LeftShoulder": "lclavicle", "LeftArm": "lhumerus", "LeftForeArm": "lradius", "LeftHand": "lwrist",
-    "LeftFingerBase": "lhand", "RightFingerBase": "rhand", "RightShoulder": "rclavicle",
-    "RightArm": "rhumerus", "RightForeArm": "rradius", "RightHand": "rwrist",
-}  # fmt: skip
-VRM = {  # humanoid bones of VRM files
-    "Hips": "hips", "LeftUpLeg": "leftUpperLeg", "LeftLeg": "leftLowerLeg", "LeftFoot": "leftFoot",
-    "LeftToe": "leftToes", "RightUpLeg": "rightUpperLeg", "RightLeg": "rightLowerLeg",
-    "RightFoot": "rightFoot", "RightToe": "rightToes", "Spine": "spine", "Spine1": "chest",
-    "Spine2": "upperChest", "Neck": "neck", "Head": "head", "LeftShoulder": "leftShoulder",
-    "LeftArm": "leftUpperArm", "LeftForeArm": "leftLowerArm", "LeftHand": "leftHand",
-    "RightShoulder": "rightShoulder", "RightArm": "rightUpperArm", "RightForeArm": "rightLowerArm",
-    "RightHand": "rightHand",
-}  # fmt: skip
+HDM = dict(  # names of joints in ASF files, as in HDM05 and CMU's database
+    Hips="root", LHipJoint="lhipjoint", LeftUpLeg="lfemur", LeftLeg="ltibia", LeftFoot="lfoot",
+    LeftToeBase="ltoes", RHipJoint="rhipjoint", RightUpLeg="rfemur", RightLeg="rtibia", RightFoot="rfoot",
+    RightToeBase="rtoes", LowerBack="lowerback", Spine="upperback", Spine1="thorax", Neck="lowerneck",
+    Neck1="upperneck", Head="head", LeftShoulder="lclavicle", LeftArm="lhumerus", LeftForeArm="lradius",
+    LeftHand="lwrist", LeftFingerBase="lhand", RightFingerBase="rhand", RightShoulder="rclavicle",
+    RightArm="rhumerus", RightForeArm="rradius", RightHand="rwrist",
+)  # fmt: skip
+VRM = dict(  # humanoid bones of VRM files
+    Hips="hips", LeftUpLeg="leftUpperLeg", LeftLeg="leftLowerLeg", LeftFoot="leftFoot", LeftToe="leftToes",
+    RightUpLeg="rightUpperLeg", RightLeg="rightLowerLeg", RightFoot="rightFoot", RightToe="rightToes",
+    Spine="spine", Spine1="chest", Spine2="upperChest", Neck="neck", Head="head", LeftShoulder="leftShoulder",
+    LeftArm="leftUpperArm", LeftForeArm="leftLowerArm", LeftHand="leftHand", RightShoulder="rightShoulder",
+    RightArm="rightUpperArm", RightForeArm="rightLowerArm", RightHand="rightHand",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(("family", "names"), [("cmu_motionbuilder", HDM), ("lafan1", VRM)])

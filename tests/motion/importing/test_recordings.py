@@ -1,7 +1,5 @@
 """Recordings: which files are found and read, and their true frame rates."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from pathlib import Path

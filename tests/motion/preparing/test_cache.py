@@ -13,12 +13,11 @@ import torch
 from processes import forked
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import RECORD, describe_body, make_builtin_rest_joints
+from memmlp.motion.body import PARENTS, RECORD, describe_body, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.geometry import compute_motion_frames
-from memmlp.motion.preparing import cache as module
 from memmlp.motion.preparing import survey as survey_module
 from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
 from memmlp.motion.preparing.manifest import Manifest
@@ -35,9 +34,8 @@ def motion(length: int, seed: int, fps: float = 60.0) -> Clip:
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     for seed in range(10):
-        write_clip(
-            tmp_path / "clips" / "a" / f"{seed}.npz", motion(60 + seed, seed, 120 if seed == 3 else 60)
-        )
+        clip = motion(60 + seed, seed, 120 if seed == 3 else 60)
+        write_clip(tmp_path / "clips" / "a" / f"{seed}.npz", clip)
     return tmp_path / "clips"
 
 
@@ -58,9 +56,8 @@ def test_the_cache_holds_the_clips_frames(root, tmp_path):
         poses, trans = (x[::step].astype(np.float32).astype(np.float64) for x in (clip.poses, clip.trans))
         expected = compute_motion_frames(torch.tensor(poses), torch.tensor(trans), rest).float()
         split = MotionDataset.open(tmp_path / "cache", record.split)
-        torch.testing.assert_close(
-            split.read_clip(split.names.index(record.name)), expected, atol=1e-5, rtol=0
-        )
+        found = split.read_clip(split.names.index(record.name))
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 def test_bad_files_are_skipped_with_a_reason_or_stop(root, tmp_path):
@@ -77,38 +74,26 @@ def test_bad_files_are_skipped_with_a_reason_or_stop(root, tmp_path):
 
 
 def test_unchanged_sources_are_not_read_again(root, tmp_path, monkeypatch):
+    """Other clips of the same sizes and times are, as from an archive that sets every file's time."""
     first = prepare_cache(source(root), tmp_path / "cache")
-
-    def no_reading(*args):
-        raise AssertionError("read a clip")
-
     with monkeypatch.context() as patch:
-        patch.setattr(survey_module, "read_clip", no_reading)
+        patch.setattr(survey_module, "read_clip", lambda *_: pytest.fail("read a clip"))
         assert prepare_cache(source(root), tmp_path / "cache") == first
-    write_clip(root / "a" / "3.npz", motion(90, 77))
-    assert prepare_cache(source(root), tmp_path / "cache").digest != first.digest
-
-
-def test_other_clips_of_the_same_sizes_and_times_are_read(root, tmp_path):
-    """As from an archive that sets every file's time."""
-    before = prepare_cache(source(root), tmp_path / "cache")
     path = next(root.rglob("*.npz"))
-    stat = path.stat()
-    clip = read_clip(path, "a")
+    stat, clip = path.stat(), read_clip(path, "a")
     write_clip(path, replace(clip, poses=clip.poses[::-1].copy()))
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     assert path.stat().st_size == stat.st_size
-    assert prepare_cache(source(root), tmp_path / "cache").digest != before.digest
+    assert prepare_cache(source(root), tmp_path / "cache").digest != first.digest
 
 
 def test_the_digest_knows_every_ingredient(root, tmp_path):
     base = prepare_cache(source(root), tmp_path / "0").digest
-    copy = tmp_path / "elsewhere"
-    shutil.copytree(root, copy)
+    copy = shutil.copytree(root, tmp_path / "elsewhere")
     assert prepare_cache(source(copy), tmp_path / "1").digest == base
     body = make_builtin_rest_joints() * 1.1
     model = tmp_path / "model.npz"
-    parents = np.array([[-1, *module.load_rest_joints.__globals__["PARENTS"][1:]], range(22)])
+    parents = np.array([[-1, *PARENTS[1:]], range(22)])
     np.savez(model, J_regressor=np.eye(22), v_template=body, kintree_table=parents)
     others = [source(root, split=SeededSplit(test=0.2, val=0.2, seed=1)), source(root, body=str(model))]
     digests = {prepare_cache(other, tmp_path / f"x{i}").digest for i, other in enumerate(others)}
@@ -133,7 +118,7 @@ def test_how_frames_are_interpolated_counts_where_some_are(root, tmp_path):
     assert not np.array_equal(ours, theirs)
 
 
-def test_an_interrupted_prepare_is_redone(root, tmp_path, monkeypatch):
+def test_unfinished_caches_and_those_of_another_format_are_made_again(root, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Manifest, "write", lambda *args: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
@@ -141,6 +126,13 @@ def test_an_interrupted_prepare_is_redone(root, tmp_path, monkeypatch):
     with pytest.raises(InputError):
         Manifest.load(tmp_path / "cache")
     assert len(prepare_cache(source(root), tmp_path / "cache").clips) == 10
+    path = tmp_path / "cache" / "manifest.json"
+    first = prepare_cache(source(root), tmp_path / "cache")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 1}))
+    with pytest.raises(InputError, match="format 1"):
+        Manifest.load(tmp_path / "cache")
+    assert prepare_cache(source(root), tmp_path / "cache") == first
+    assert str(tmp_path) not in path.read_text()
 
 
 def _digest(root: Path, cache: Path, said: Path) -> None:
@@ -163,20 +155,14 @@ def test_every_clip_knows_its_group(root, tmp_path):
     tied = SeededSplit(test=0.2, val=0.2, groups=["a/[12]$", "a/[23]$"])
     manifest = prepare_cache(source(root, split=tied), tmp_path / "cache")
     expected = {f"a/{n}": "a/1" if n in (1, 2, 3) else f"a/{n}" for n in range(10)}
-    assert manifest.groups == expected
-    assert Manifest.load(tmp_path / "cache").groups == expected
+    assert manifest.groups == Manifest.load(tmp_path / "cache").groups == expected
     for part in ("train", "val", "test"):
         frames = MotionDataset.open(tmp_path / "cache", part).to("cpu")
         assert frames.groups == [expected[name] for name in frames.names]
-    alone = prepare_cache(source(root), tmp_path / "alone")
-    assert alone.groups == {name: name for name in expected}
-
-
-def test_other_groups_change_the_cache_but_not_its_digest(root, tmp_path):
     splits = SeededSplit(test=0, val=0), SeededSplit(test=0, val=0, groups=["a/[12]$"])
-    first, second = (prepare_cache(source(root, split=split), tmp_path / "cache") for split in splits)
-    assert first.digest == second.digest
-    assert (first.groups["a/2"], second.groups["a/2"]) == ("a/2", "a/1")
+    first, second = (prepare_cache(source(root, split=split), tmp_path / "other") for split in splits)
+    assert first.groups == {name: name for name in expected}
+    assert (first.digest, second.groups["a/2"]) == (second.digest, "a/1")
 
 
 def test_frames_of_an_older_component_version_are_made_again(root, tmp_path, monkeypatch):
@@ -197,13 +183,3 @@ def test_clips_are_prepared_on_the_body_of_their_import(root, tmp_path):
         with pytest.raises(InputError, match=r"model\.npz.*data\.body"):
             prepare_cache(source(root), tmp_path / "cache")
         (folder / RECORD).unlink()
-
-
-def test_a_cache_of_another_format_is_made_again(root, tmp_path):
-    path = tmp_path / "cache" / "manifest.json"
-    first = prepare_cache(source(root), tmp_path / "cache")
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 1}))
-    with pytest.raises(InputError, match="format 1"):
-        Manifest.load(tmp_path / "cache")
-    assert prepare_cache(source(root), tmp_path / "cache") == first
-    assert str(tmp_path) not in path.read_text()

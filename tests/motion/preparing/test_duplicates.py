@@ -1,7 +1,5 @@
 """Clips that share motion: in one part, and one group."""
 
-from __future__ import annotations
-
 import functools
 from collections import Counter
 from collections.abc import Callable
@@ -16,17 +14,12 @@ from scipy.spatial.transform import Rotation
 from memmlp.motion.body import SWAPPED
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.preparing import duplicates
 from memmlp.motion.preparing import survey as survey_module
 from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
-from memmlp.motion.preparing.duplicates import (
-    REACH,
-    assign_parts,
-    drop_copies_across_parts,
-    mark_frames,
-    merge_groups,
-)
+from memmlp.motion.preparing.duplicates import REACH, assign_parts, mark_frames
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
-from memmlp.motion.preparing.splits import Assignment, ListSplit, MixedSplit, SeededSplit
+from memmlp.motion.preparing.splits import Assignment, MixedSplit, SeededSplit
 from memmlp.motion.preparing.survey import survey_folder
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -40,21 +33,20 @@ def records(contents: dict[str, str]) -> list[ClipRecord]:
 
 def test_training_gives_way_to_validation_and_both_to_testing():
     parts = {"a": "train", "b": "val", "c": "test", "d": "val", "e": "train", "f": "train"}
-    kept, gave_way = drop_copies_across_parts(records(CONTENTS), parts | {"g": "train", "h": "test"})
+    kept, gave_way = duplicates.drop_copies_across_parts(
+        records(CONTENTS), parts | {"g": "train", "h": "test"}
+    )
     assert kept == parts | {"a": None, "d": None, "e": None, "g": "train", "h": "test"}
     assert gave_way == {"a": "c", "d": "c", "e": "b"}
     one = dict.fromkeys(CONTENTS, "train") | {"c": None}
-    assert drop_copies_across_parts(records(CONTENTS), one) == (one, {})
+    assert duplicates.drop_copies_across_parts(records(CONTENTS), one) == (one, {})
 
 
-def test_groups_with_copies_are_merged():
+def test_groups_with_copies_are_merged_although_a_published_list_is_kept():
     groups = {"a": "a", "b": "b", "c": "c", "d": "d", "e": "d", "f": "f", "g": "c", "h": "h"}
-    assert merge_groups(records(CONTENTS), groups) == {
+    assert duplicates.merge_groups(records(CONTENTS), groups) == {
         "a": "a", "b": "a", "c": "a", "d": "a", "e": "a", "f": "f", "g": "a", "h": "h",
     }  # fmt: skip
-
-
-def test_a_published_list_is_kept_although_copies_join_its_groups():
     given = Assignment(dict.fromkeys(CONTENTS, "train") | {"c": "test"}, {name: name for name in CONTENTS})
     split = mock.Mock(listed={"CMU": 8}, assign=mock.Mock(return_value=given))
     parts, groups, gave_way = assign_parts(split, records(CONTENTS))
@@ -76,9 +68,6 @@ def test_a_copy_leaves_the_limit_of_clips_of_a_group():
     assert set(held_out.values()) == {2}
     assert groups[names[10]] == groups[names[0]]
     assert gave_way == {}
-
-
-# Changed copies
 
 
 @functools.cache
@@ -124,33 +113,39 @@ def at_120_hz(root: Path) -> Path:
     return root
 
 
+def write_all(root: Path, change: Callable[[Clip], Clip]) -> dict[str, str]:
+    """Write a changed copy of each activity, and return the duplicates that should be found."""
+    for activity in ACTIVITIES:
+        write_clip(root / "b" / f"{activity}.npz", change(recorded(activity)))
+    return {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
+
+
 @pytest.mark.parametrize(("fps", "change"), [(20.0, lambda clip: clip), (119.88, mirrored)])
 def test_a_copy_at_another_rate_is_found(
     root: Path, monkeypatch: pytest.MonkeyPatch, fps: float, change: Callable[[Clip], Clip]
 ):
     monkeypatch.setattr(survey_module, "find_shared_stretches", lambda *_: [])
-    at_120_hz(root)
     for activity in ACTIVITIES:
-        again = resample(recorded(activity, fps=120.0), fps)[0]
-        write_clip(root / "b" / f"{activity}_again.npz", change(again))
+        clip = recorded(activity, fps=120.0)
+        write_clip(root / "a" / f"{activity}.npz", clip)
+        write_clip(root / "b" / f"{activity}.npz", change(resample(clip, fps)[0]))
     found = survey_folder(root)
-    assert found.duplicates == {f"b/{activity}_again": f"a/{activity}" for activity in ACTIVITIES}
+    assert found.duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
     assert len(found.clips) == 2 * len(ACTIVITIES)
 
 
 def test_copies_of_copies_are_one(root: Path):
-    for fps in (24.0, 60.0, 90.0):
+    for fps in (24.0, 90.0):
         write_clip(root / "b" / f"{fps:g}.npz", resample(recorded("walking", fps=120.0), fps)[0])
-    write_clip(root / "a" / "walking.npz", recorded("walking", fps=120.0))
-    write_clip(root / "c.npz", recorded("walking", fps=120.0))
-    assert set(survey_folder(root).duplicates.values()) == {"a/walking"}
-    assert len(survey_folder(root).duplicates) == 4
+    for name in ("a/walking", "c"):
+        write_clip(root / f"{name}.npz", recorded("walking", fps=120.0))
+    assert survey_folder(root).duplicates == dict.fromkeys(("b/24", "b/90", "c"), "a/walking")
 
 
 def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(survey_module, "find_shared_stretches", lambda *_: [])
-    at_120_hz(root)
-    clip, run = (resample(recorded(name, fps=120.0), 60.0)[0] for name in ("walking", "running"))
+    clip, run = (cut(recorded(name), 0, 120) for name in ("walking", "running"))
+    write_clip(root / "a" / "walking.npz", clip)
     write_clip(root / "b" / "turns.npz", replace(clip, poses=np.concatenate([clip.poses[:1], run.poses[1:]])))
     write_clip(root / "b" / "part.npz", cut(clip, 0, 60))
     slope = np.linspace(0, 0.1, len(clip))[:, None] * [1, 0, 0]
@@ -158,53 +153,44 @@ def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypa
     assert survey_folder(root).duplicates == {}
 
 
+def between(clip: Clip) -> Clip:
+    """Frames halfway between those of a clip."""
+    twice = resample(clip, 120.0)[0]
+    return replace(twice, poses=twice.poses[1::2], trans=twice.trans[1::2], fps=60.0)
+
+
 def backwards(clip: Clip) -> Clip:
     return replace(clip, poses=clip.poses[::-1], trans=clip.trans[::-1])
 
 
-@pytest.mark.parametrize(
-    "change",
-    [elsewhere, lambda clip: rounded(cut(mirrored(clip), 97, 230)), lambda clip: backwards(cut(clip, 5))],
-)
+@pytest.mark.parametrize("change", [
+    elsewhere, between, lambda clip: backwards(cut(clip, 5)),
+    lambda clip: rounded(cut(mirrored(clip), 97, 230)),
+])  # fmt: skip
 def test_a_clip_that_shares_a_stretch_is_found(root: Path, change: Callable[[Clip], Clip]):
-    for activity in ACTIVITIES:
-        write_clip(root / "b" / f"{activity}.npz", change(recorded(activity)))
-    assert survey_folder(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
-
-
-def test_frames_between_those_of_another_clip_are_a_copy(root: Path):
-    for activity in ACTIVITIES:
-        twice = resample(recorded(activity), 120.0)[0]
-        odd = replace(twice, poses=twice.poses[1::2], trans=twice.trans[1::2], fps=60.0)
-        write_clip(root / "b" / f"{activity}.npz", odd)
-    assert survey_folder(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
+    expected = write_all(root, change)
+    assert survey_folder(root).duplicates == expected
 
 
 def test_overlapping_windows_of_a_recording_are_one_group(root: Path):
     """Each overlaps the next by two seconds, and the first and the last have nothing in common."""
-    recording = synthesize_clip("reaching", 5, seconds=14.0)
-    for start in range(0, 600, 120):
-        write_clip(root / f"window_{start:03}.npz", cut(recording, start, start + 240))
-    assert set(survey_folder(root).duplicates.values()) == {"window_000"}
-    assert len(survey_folder(root).duplicates) == 4
-
-
-def test_repetitions_and_cuts_without_common_frames_are_different(root: Path):
     recording = synthesize_clip("reaching", 5, seconds=10.0)
-    for activity in ACTIVITIES:
-        write_clip(root / f"{activity}_again.npz", recorded(activity, 2))
+    for start in range(0, 480, 120):
+        write_clip(root / f"window_{start:03}.npz", cut(recording, start, start + 240))
+    found = survey_folder(root).duplicates
+    assert (set(found.values()), len(found)) == ({"window_000"}, 3)
+
+
+def test_repetitions_cuts_and_common_rest_poses_are_different(root: Path):
+    recording = synthesize_clip("reaching", 5, seconds=10.0)
     for name, (start, end) in {"first": (0, 300), "second": (300, 600)}.items():
         write_clip(root / f"{name}.npz", cut(recording, start, end))
-    assert survey_folder(root).duplicates == {}
-
-
-def test_a_common_rest_pose_is_not_a_shared_stretch(root: Path):
     for activity in ("walking", "waving"):
-        clip = synthesize_clip(activity, 7, seconds=4.0)
-        still = np.zeros((180, 22, 3), np.float32)
+        clip = recorded(activity, 2)
         place = np.repeat(clip.trans[:1], 180, 0)
-        poses, trans = np.concatenate([still, clip.poses]), np.concatenate([place, clip.trans])
-        write_clip(root / f"{activity}_late.npz", replace(clip, poses=poses, trans=trans))
+        poses = np.concatenate([np.zeros((180, 22, 3), np.float32), clip.poses])
+        late = replace(clip, poses=poses, trans=np.concatenate([place, clip.trans]))
+        write_clip(root / f"{activity}_again.npz", late)
     assert survey_folder(root).duplicates == {}
 
 
@@ -216,23 +202,9 @@ def test_a_clip_too_short_for_a_stretch_has_no_marks_beyond_its_middle():
 
 
 def test_copies_are_drawn_together(root: Path, tmp_path: Path):
-    for activity in ACTIVITIES:
-        again = cut(recorded(activity), 60)
-        write_clip(root / "b" / f"{activity}.npz", again if activity < "s" else resample(again, 30.0)[0])
+    write_all(root, lambda clip: cut(clip, 60))
     manifest = prepare_cache(ClipFolder(root, SeededSplit(test=0.3, val=0.3)), tmp_path / "cache")
     parts = {clip.name: clip.split for clip in manifest.clips}
     assert set(parts.values()) == {"train", "val", "test"}
     assert all(parts[f"a/{activity}"] == parts[f"b/{activity}"] for activity in ACTIVITIES)
     assert len({clip.group for clip in manifest.clips}) == len(ACTIVITIES)
-
-
-def test_the_training_part_of_a_list_gives_way_to_its_test_part(root: Path, tmp_path: Path):
-    write_clip(root / "b" / "cut.npz", cut(recorded("running"), 90))
-    for part, names in (("train", [f"a/{name}" for name in ACTIVITIES]), ("test", ["b/cut"])):
-        lists = tmp_path / "lists" / names[0].split("/")[0]
-        lists.mkdir(parents=True)
-        for phase in ("train", "test"):
-            (lists / f"{phase}_split.txt").touch()
-        (lists / f"{part}_split.txt").write_text("".join(f"{name}.npz\n" for name in names))
-    manifest = prepare_cache(ClipFolder(root, ListSplit(tmp_path / "lists", val=0)), tmp_path / "cache")
-    assert manifest.duplicates == {"a/running": "b/cut"}

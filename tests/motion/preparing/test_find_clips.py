@@ -25,26 +25,16 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "root"
 
 
-def test_any_case_of_the_suffix_is_found(root):
-    found = find_clips(root)
-    assert found.files == ["a/1.npz", "a/2.npz", "b/UP.NPZ"]
-    assert [get_clip_name(file) for file in found.files] == ["a/1", "a/2", "b/UP"]
-
-
-def test_hidden_folders_and_files_are_no_data(root):
-    hidden = root / ".cmu-4stpviek" / "clips"
-    hidden.mkdir(parents=True)
-    (hidden / "1.npz").write_text("unfinished")
+def test_files_of_any_case_are_found_without_hidden_ones_and_links_in_circles(root):
+    (root / ".cmu-4stpviek" / "clips").mkdir(parents=True)
+    (root / ".cmu-4stpviek" / "clips" / "1.npz").write_text("unfinished")
     (root / "a" / ".3.npz").write_text("unfinished")
-    assert find_clips(root).files == ["a/1.npz", "a/2.npz", "b/UP.NPZ"]
-
-
-def test_links_in_circles_are_followed_once(root):
     (root / "a" / "loop").symlink_to("..")
     (root / "self").symlink_to(".")
     (root / "endless.npz").symlink_to("endless.npz")
-    found = find_clips(root)
-    assert found.files == ["a/1.npz", "a/2.npz", "b/UP.NPZ", "endless.npz"]
+    found = find_clips(root).files
+    assert found == ["a/1.npz", "a/2.npz", "b/UP.NPZ", "endless.npz"]
+    assert [get_clip_name(file) for file in found] == ["a/1", "a/2", "b/UP", "endless"]
 
 
 def test_a_file_of_several_paths_is_found_by_the_shortest_real_one(root, tmp_path):
@@ -57,15 +47,10 @@ def test_a_file_of_several_paths_is_found_by_the_shortest_real_one(root, tmp_pat
     (root / "c").symlink_to(tmp_path / "other")
     found = find_clips(root)
     assert found.files == ["a/1.npz", "b/UP.NPZ", "c/9.npz", "top.npz"]
-
-
-def test_a_folder_without_clips_is_one_line(tmp_path):
-    for where in (tmp_path, tmp_path / "none"):
+    (tmp_path / "empty").mkdir()
+    for where in (tmp_path / "empty", tmp_path / "none"):
         with pytest.raises(InputError, match=r"data\.root"):
             find_clips(where)
-
-
-# Several folders
 
 
 @pytest.fixture

@@ -21,25 +21,24 @@ def written(folder, text):
     return file
 
 
-def test_columns_in_any_order_with_others_beside_them(tmp_path):
+def test_groups_are_read_and_named(tmp_path):
     file = written(tmp_path, "\ufeffsession,group,clip\n1,ann,./a/1.npz\n2, ben ,b/2\n")
     assert read_groups(file) == {"a/1": "ann", "b/2": "ben"}
+    rows = Grouping.from_settings(["^(x)"], written(tmp_path, "clip,group\na,ann\nb,ann\nx1,ben\nx2,cy\n"))
+    seen = {name: name for name in ("b", "a", "x2", "x1")}
+    assert rows.name_groups(seen) == {"a": "ann", "b": "ann", "x1": "ben", "x2": "ben"}
+    found = Grouping.from_settings(["^(x)"], None).name_groups(seen)
+    assert found == {"a": "a", "b": "b", "x1": "x1", "x2": "x1"}
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("clip,subject\na,b\n", "no column group"),
-        ("", "no column clip"),
-        ("clip,group\na,1\nb,\n", "line 3 lacks"),
-        ("clip,group\na\n", "line 2 lacks"),
-        ("clip,group\na,1\na.npz,2\n", "line 3 gives a"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), [
+    ("clip,subject\na,b\n", "no column group"), ("", "no column clip"),
+    ("clip,group\na,1\nb,\n", "line 3 lacks"), ("clip,group\na\n", "line 2 lacks"),
+    ("clip,group\na,1\na.npz,2\n", "line 3 gives a"),
+])  # fmt: skip
 def test_bad_files_in_one_line(tmp_path, text, said):
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=rf"\A.*{said}.*\Z"):
         read_groups(written(tmp_path, text))
-    assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="groups_file"):
         read_groups(tmp_path / "none.csv")
 
@@ -52,21 +51,6 @@ def test_clips_without_a_row_and_rows_without_a_clip_are_named(tmp_path):
     with pytest.raises(InputError, match=r"data\.root.* c$"):
         grouping.check(["a", "b"], ["a", "b"])
     Grouping.from_settings([], None).check(["a"], [])
-
-
-def test_a_group_is_named_by_the_file_else_after_its_first_clip(tmp_path):
-    rows = Grouping.from_settings(["^(x)"], written(tmp_path, "clip,group\na,ann\nb,ann\nx1,ben\nx2,cy\n"))
-    seen = {name: name for name in ("b", "a", "x2", "x1")}
-    assert rows.name_groups(seen) == {"a": "ann", "b": "ann", "x1": "ben", "x2": "ben"}
-    assert Grouping.from_settings(["^(x)"], None).name_groups(seen) == {
-        "a": "a",
-        "b": "b",
-        "x1": "x1",
-        "x2": "x1",
-    }
-
-
-# Remarks
 
 
 def manifest_of(parts: Sequence[tuple[str, str]], split: dict[str, Any], tied: Sequence[str] = ()) -> Any:
@@ -83,20 +67,16 @@ FLAT = [("salsa/1", "train"), ("salsa/2", "test"), ("own/1", "train"), ("own/2",
 SESSIONS = [(f"{name.rpartition('/')[0]}/session{name[-1]}/take", part) for name, part in TAKES]
 
 
-@pytest.mark.parametrize(
-    ("parts", "split", "said"),
-    [
-        (TAKES, {"groups": ["salsa/(.*)"]}, "2 test clips share no group with other clips"),
-        (TAKES, {}, "2 test clips share no group with other clips"),
-        (TAKES, {"groups": ["own/(.*?)/"]}, ""),
-        (TAKES[:2], {}, ""),  # all in one folder, which is no person
-        ([("a/1", "train"), ("a/2", "val"), ("b/1", "test")], {}, ""),
-        ([(f"x/{name}", part) for name, part in TAKES], SOURCES, "2 test clips"),
-        (FLAT, {"groups": ["salsa/(.*)"]}, "1 test clips share no group with other clips"),
-        (SESSIONS, {}, "2 test clips share no group with other clips"),
-        ([("c1/a", "train"), ("c2/a", "test"), ("c3/a", "train")], {}, ""),  # no folder is shared
-    ],
-)
+@pytest.mark.parametrize(("parts", "split", "said"), [
+    (TAKES, {"groups": ["salsa/(.*)"]}, "2 test clips share no group with other clips"),
+    (TAKES, {"groups": ["own/(.*?)/"]}, ""),
+    (TAKES[:2], {}, ""),  # all in one folder, which is no person
+    ([("a/1", "train"), ("a/2", "val"), ("b/1", "test")], {}, ""),
+    ([(f"x/{name}", part) for name, part in TAKES], SOURCES, "2 test clips"),
+    (FLAT, {"groups": ["salsa/(.*)"]}, "1 test clips share no group with other clips"),
+    (SESSIONS, {}, "2 test clips share no group with other clips"),
+    ([("c1/a", "train"), ("c2/a", "test"), ("c3/a", "train")], {}, ""),  # no folder is shared
+])  # fmt: skip
 def test_folders_with_clips_in_training_and_in_test_are_told(parts, split, said):
     """A folder is often a person, and no shipped pattern knows a custom folder."""
     found = describe_divided_folders(manifest_of(parts, split))

@@ -39,13 +39,10 @@ def test_one_bad_file_never_stops_a_folder(root):
     shutil.copy(root / "a" / "0.npz", root / "a" / "1.NPZ")
     (root / "directory.npz").mkdir()
     found = survey_folder(root)
-    assert {file.file: file.reason.split(";")[0] for file in found.skipped} == {
-        "text.npz": "not a zip, so not an npz file",
-        "dangling.npz": "cannot be read (No such file or directory)",
-        "pipe.npz": "not a regular file",
-        r"line\nfeed.npz": "the name has control characters",
-        "a/1.npz": "a/1.NPZ has the same name",
-    }
+    assert {file.file: file.reason.split()[:2] for file in found.skipped} == {
+        "text.npz": ["not", "a"], "dangling.npz": ["cannot", "be"], "pipe.npz": ["not", "a"],
+        r"line\nfeed.npz": ["the", "name"], "a/1.npz": ["a/1.NPZ", "has"],
+    }  # fmt: skip
     assert len(found.clips) == 4
     assert all(file.reason.isprintable() for file in found.skipped)
 
@@ -61,14 +58,6 @@ def test_other_units_are_skipped_and_odd_clips_are_reported(root):
     assert set(found.unusual) == {"x"}
 
 
-def contents(manifest: Manifest) -> dict[str, set[str]]:
-    """content -> the parts that have it."""
-    parts: dict[str, set[str]] = {}
-    for clip in manifest.clips:
-        parts.setdefault(clip.content, set()).add(clip.split)
-    return parts
-
-
 def test_no_frames_are_in_two_parts_however_they_were_copied(root, tmp_path):
     (root / "loop").symlink_to(".")
     os.link(root / "a" / "0.npz", root / "hard.npz")
@@ -77,13 +66,11 @@ def test_no_frames_are_in_two_parts_however_they_were_copied(root, tmp_path):
         (root / "b").mkdir(exist_ok=True)
         shutil.copy(root / "a" / f"{name}.npz", root / "b" / f"{name}.npz")
         again(root / "a" / f"{name}.npz", root / "b" / f"again{name}.npz")
-    manifest = prepare_cache(
-        ClipFolder(root, SeededSplit(test=0.3, val=0.3), min_frames=20), tmp_path / "cache"
-    )
+    folder = ClipFolder(root, SeededSplit(test=0.3, val=0.3), min_frames=20)
+    manifest = prepare_cache(folder, tmp_path / "cache")
     assert manifest == Manifest.load(tmp_path / "cache")
-    parts = contents(manifest)
-    assert len(parts) == 4
-    assert all(len(several) == 1 for several in parts.values())
+    assert len({clip.content for clip in manifest.clips}) == 4
+    assert len({(clip.content, clip.split) for clip in manifest.clips}) == 4
     assert len(manifest.clips) == 12
     assert manifest.duplicates == {}
     assert all(total.clips for total in manifest.totals.values())
@@ -93,16 +80,14 @@ def test_no_frames_are_in_two_parts_however_they_were_copied(root, tmp_path):
 def test_a_list_with_the_same_frames_in_two_parts_keeps_those_of_its_test(root, tmp_path):
     (root / "b").mkdir()
     shutil.copy(root / "a" / "1.npz", root / "b" / "copy.npz")
-    folder = tmp_path / "lists" / "a"
-    folder.mkdir(parents=True)
-    (folder / "train_split.txt").write_text("".join(f"a/{n}.npz\n" for n in range(4)))
-    (folder / "test_split.txt").touch()
-    (folder.parent / "b").mkdir()
-    (folder.parent / "b" / "train_split.txt").touch()
-    (folder.parent / "b" / "test_split.txt").write_text("b/copy.npz\n")
-    manifest = prepare_cache(
-        ClipFolder(root, ListSplit(tmp_path / "lists"), min_frames=20), tmp_path / "cache"
-    )
+    for subset, part, names in (("a", "train", [f"a/{n}" for n in range(4)]), ("b", "test", ["b/copy"])):
+        folder = tmp_path / "lists" / subset
+        folder.mkdir(parents=True)
+        for phase in ("train", "test"):
+            (folder / f"{phase}_split.txt").touch()
+        (folder / f"{part}_split.txt").write_text("".join(f"{name}.npz\n" for name in names))
+    clips = ClipFolder(root, ListSplit(tmp_path / "lists"), min_frames=20)
+    manifest = prepare_cache(clips, tmp_path / "cache")
     assert manifest.duplicates == {"a/1": "b/copy"}
     assert {clip.name for clip in manifest.clips} == {"a/0", "a/2", "a/3", "b/copy"}
     assert manifest.left_out == {}
