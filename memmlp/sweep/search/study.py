@@ -108,7 +108,8 @@ class Study:
         return self._suggest_values(self.study.ask())
 
     def _suggest_values(self, trial: Trial) -> Trial:
-        for one in self.search.space:
+        for index, one in enumerate(self.search.space, 1):
+            self.study.sampler = make_sampler(self.search, trial.number, index)
             suggest_value(trial, one)
         return trial
 
@@ -223,12 +224,12 @@ def _make_damage_error(path: Path, reason: object) -> InputError:
     return InputError(f"{path}: must be an Optuna journal ({reason}); move it away to restart the search")
 
 
-def make_sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
-    """Return the sampler of a trial, seeded with the search's seed and the trial's number.
+def make_sampler(search: Search, number: int, key: int = 0) -> optuna.samplers.BaseSampler:
+    """Return the sampler of a trial, or of one of its keys, seeded with the search's seed and both numbers.
 
-    With the number, a resumed search does not repeat the random numbers of earlier trials.
+    So random values are the same if the search is killed at any moment and resumed, even within a trial.
     """
-    seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
+    seed = int(np.random.SeedSequence([search.seed, number, key]).generate_state(1)[0])
     if search.startup is None or search.sampler != "tpe":  # the trials of a grid already have values
         return optuna.samplers.RandomSampler(seed=seed)
     with warnings.catch_warnings():
