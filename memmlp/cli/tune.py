@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -120,18 +120,31 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     if not isinstance(content, dict):
         raise InputError("search: must be the name of a file in conf/search")
     activate(find_named_packages(map(str, content.get("base") or ())))
+    remaining = tuple(text for text in overrides if text not in own)
+    _complete_kinematic_loss(content, [*content["base"], *remaining])
     best = BestTrial()
     if isinstance(folder := content.get("after"), str):
         best = read_best_trial(Path(folder))
         content["base"] = [*best.overrides, *content["base"]]
     parsed = parse_search(content, best.values)
-    remaining = tuple(text for text in overrides if text not in own)
     setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
     base = _check_space(setup)
     if not _make_requests(setup, {})[0].motion.prepare().has("val"):
         raise InputError("data.split.val: must be above 0 for a search, which ranks trials on validation")
     counted = {**asdict(parsed), "n_trials": None, "after": None, "storage": None}
     return setup._replace(folder=outputs / "tune" / f"{parsed.name}-{digest([base, counted])[:8]}")
+
+
+def _complete_kinematic_loss(content: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Replace the choice `kinematic` of the loss by the network's own overrides for it."""
+    from memmlp.common.components import find_chosen_settings
+    from memmlp.config.compose import compose_config
+
+    match content:
+        case {"space": {"loss": {"choices": [*choices]}}} if "kinematic" in choices:
+            settings = find_chosen_settings(compose_config(list(overrides)), "model")
+            full = getattr(settings, "kinematic", "kinematic")
+            content["space"]["loss"]["choices"] = [full if one == "kinematic" else one for one in choices]
 
 
 def _check_space(setup: SearchSetup) -> str:

@@ -156,6 +156,18 @@ def sized(tiny: Any, small: Any, paper: Any, width_fraction: float = 0) -> str:
     return _format_choice("size", tiny, small, paper, *([width_fraction] if width_fraction else []))
 
 
+def tuned(lr: float, warmup: float = 0.05) -> dict[str, Any]:
+    """Return the recipe of a network with the learning rate that a search found at the size `small`.
+
+    Other sizes have `profile.lr`, without a warm-up.
+
+    Args:
+        lr: the learning rate.
+        warmup: the length of the warm-up as a fraction of the steps.
+    """
+    return {"optim.lr": sized("${profile.lr}", lr, "${profile.lr}"), "optim.warmup": sized(0, warmup, 0)}
+
+
 def _format_choice(resolver: str, *values: Any) -> str:
     words = ("null" if value is None else str(value).lower() for value in values)
     return f"${{{resolver}:{','.join(words)}}}"

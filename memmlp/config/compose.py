@@ -287,6 +287,10 @@ def _check_effects(cfg: DictConfig, overrides: Sequence[str]) -> None:
             )
     sources = (cfg.data.get("sources") or {}).values()
     for override in parse_overrides(overrides):
+        if override.key == "profile.lr" and cfg.optim.lr != cfg.profile.lr:
+            raise InputError(
+                f"{override}: has no effect, since model={cfg.model.name} sets optim.lr; set optim.lr"
+            )
         part = override.key.removeprefix("data.split.")
         own = [one.get(part) for one in sources] if part in ("test", "val") else [None]
         if own and None not in own:

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, setting
+from memmlp.common.settings import at_least, setting, tuned
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import Diffusion, TimeEmbedding
@@ -65,6 +65,7 @@ class AGRoLMLPSettings(NetworkSettings):
     depth: int = setting(at_least(1), 12)  # number of blocks
 
     defaults: ClassVar = {"loss": "agrol"}
+    recipe: ClassVar = tuned(8.0e-3)
 
 
 class AGRoLMLP(WindowModel):

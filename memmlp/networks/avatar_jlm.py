@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, fraction, setting
+from memmlp.common.settings import at_least, fraction, setting, tuned
 from memmlp.motion.body import (
     HEAD,
     N_JOINTS,
@@ -127,6 +127,7 @@ class AvatarJLMSettings(NetworkSettings):
     coarse_weight: float = setting(at_least(0), 1.0)  # weight of the loss for the coarse pose's joints
 
     defaults: ClassVar = {"loss": "avatar_jlm"}
+    recipe: ClassVar = tuned(8.0e-3)
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:

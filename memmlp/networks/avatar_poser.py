@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, fraction, setting
+from memmlp.common.settings import at_least, fraction, setting, tuned
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM, SPARSE_POSITION, TRACKED
 from memmlp.motion.network_coordinates import HeadRelative
 from memmlp.motion.normalizer import Normalizer
@@ -85,6 +85,7 @@ class AvatarPoserSettings(NetworkSettings):
 
     learns_newest_frame: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "avatar_poser"}
+    recipe: ClassVar = tuned(4.0e-3)
 
 
 class AvatarPoser(NewestFrameModel):

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, positive, setting
+from memmlp.common.settings import at_least, positive, setting, tuned
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import AncestralDiffusion, DenoiserOutput, TimeEmbedding
@@ -113,9 +113,12 @@ class BoDiffusionSettings(NetworkSettings):
 
     trains_by_itself: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "of_network"}
-    recipe: ClassVar = {
-        "profile.ema": 0.9999
-    }  # the default of optim.ema: the averaged weights that its authors train
+    # profile.ema is the default of optim.ema: the averaged weights that its authors train
+    recipe: ClassVar = {"profile.ema": 0.9999, **tuned(2.0e-3)}
+    # with weights of 1 it did not learn the motion (docs/results/recurrent_poser.md)
+    kinematic: ClassVar[str] = (
+        f"{NetworkSettings.kinematic} model.noise_weight=1000.0 model.bound_weight=1000.0"
+    )
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, setting
+from memmlp.common.settings import at_least, setting, tuned
 from memmlp.motion.body import N_JOINTS, ROTATION
 from memmlp.motion.geometry import matrix_to_sixd
 from memmlp.motion.normalizer import Normalizer
@@ -41,7 +41,7 @@ class ConstantPoseSettings(NetworkSettings):
     frames: int = setting(at_least(2), tiny=10, small=40, paper=40)
 
     defaults: ClassVar = {"loss": "avatar_poser"}
-    recipe: ClassVar = {"normalizer.coordinates": "heading", "normalizer.z_scores": True}
+    recipe: ClassVar = {"normalizer.coordinates": "heading", "normalizer.z_scores": True, **tuned(8.0e-3)}
 
 
 class ConstantPose(WindowlessModel):

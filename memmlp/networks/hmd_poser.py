@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, fraction, setting
+from memmlp.common.settings import at_least, fraction, setting, tuned
 from memmlp.motion.body import (
     ROTATION,
     SPARSE_ANGULAR_VELOCITY,
@@ -181,6 +181,7 @@ class HMDPoserSettings(NetworkSettings):
     shape_weight: float = setting(at_least(0), 0.1)
 
     defaults: ClassVar = {"loss": "hmd_poser"}
+    recipe: ClassVar = tuned(8.0e-3)
 
 
 class HMDPoser(WindowlessModel):

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from memmlp.common import distributed
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, fraction, setting
+from memmlp.common.settings import at_least, fraction, setting, tuned
 from memmlp.motion.body import (
     HEAD,
     N_JOINTS,
@@ -248,6 +248,7 @@ class ManikinSSettings(AvatarPoserSettings):
     turned: bool = setting(default=True)  # true: rotate training windows to random headings
 
     defaults: ClassVar = {"loss": "manikin_s"}
+    recipe: ClassVar = tuned(2.0e-3)
 
 
 class ManikinS(Manikin, AvatarPoser):
@@ -327,6 +328,7 @@ class ManikinLSettings(AvatarJLMSettings):
     offline: bool = setting(default=False)
 
     defaults: ClassVar = {"loss": "manikin_l"}
+    recipe: ClassVar = {"optim.lr": "${profile.lr}", "optim.warmup": 0}  # not searched
 
 
 class ManikinL(Manikin, AvatarJLM):

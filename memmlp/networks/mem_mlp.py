@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component, find_chosen_settings
-from memmlp.common.settings import Settings, at_least, setting
+from memmlp.common.settings import Settings, at_least, setting, tuned
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock, PlainFusion
@@ -167,6 +167,9 @@ class MemMLPSettings(Settings):
     # d, the width of the hidden state
     width: int = setting(at_least(1), tiny=16, small=128, paper=512, width_fraction=1)
     depth: int = setting(at_least(1), 8)  # L, the number of blocks
+
+    recipe: ClassVar = tuned(8.0e-3)
+    kinematic: ClassVar[str] = "kinematic predictor=rotation_only hand=off"
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:

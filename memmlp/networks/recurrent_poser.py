@@ -290,7 +290,7 @@ class RecurrentPoserSettings(NetworkSettings):
     recipe: ClassVar = {
         "optim.batch": sized(8, 64, 256),
         "optim.lr": 8.0e-3,
-        "optim.warmup": sized(0, 100, 1000),
+        "optim.warmup": sized(0, 0.05, 1 / 300),
         "optim.weight_decay": sized(0.3, 0.3, 2.0e-3),
         "normalizer.coordinates": "heading",
         "normalizer.z_scores": True,

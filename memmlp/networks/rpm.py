@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, fraction, setting
+from memmlp.common.settings import at_least, fraction, setting, tuned
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
@@ -59,7 +59,7 @@ class RPMSettings(NetworkSettings):
     horizon: int = setting(at_least(1), 10)
 
     defaults: ClassVar = {"loss": "rpm"}
-    recipe: ClassVar = {"normalizer.z_scores": True}
+    recipe: ClassVar = {"normalizer.z_scores": True, **tuned(8.0e-3)}
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:

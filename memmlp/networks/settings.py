@@ -17,6 +17,8 @@ class NetworkSettings(Settings):
     Attributes:
         learns_newest_frame: whether training learns only the newest frame of each window.
         carries_state: whether training can carry the network's state from step to step (`rollout=streams`).
+        kinematic: the option of `loss` with this project's loss, and the overrides that go with it; searches
+            use them.
         trains_by_itself: whether the network's own loss is enough to train it (`loss=of_network`).
     """
 
@@ -25,6 +27,7 @@ class NetworkSettings(Settings):
     learns_newest_frame: ClassVar[bool] = False
     carries_state: ClassVar[bool] = False
     trains_by_itself: ClassVar[bool] = False
+    kinematic: ClassVar[str] = "kinematic normalizer.coordinates=heading"
     defaults: ClassVar = {"memory": None, "predictor": None, "hand": None}
     recipe: ClassVar = {
         "normalizer.coordinates": "world",

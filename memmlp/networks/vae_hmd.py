@@ -17,7 +17,7 @@ from torch.func import functional_call
 
 from memmlp.common import distributed
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, fraction, setting
+from memmlp.common.settings import at_least, fraction, setting, tuned
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION, SPARSE_ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import Dropout
@@ -121,6 +121,8 @@ class VAEHMDSettings(NetworkSettings):
     divergence_weight: float = setting(at_least(0), 1.0)
 
     defaults: ClassVar = {"loss": "vae_hmd"}
+    recipe: ClassVar = tuned(8.0e-3)
+    kinematic: ClassVar[str] = f"{NetworkSettings.kinematic} model.divergence_weight=0.01"
 
 
 class VAEHMD(WindowlessModel):

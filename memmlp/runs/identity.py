@@ -257,7 +257,8 @@ def list_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
     if schedule := optim.get("schedule"):
         yield f"schedule.{schedule}"
     yield from (name for name in ("warmup", "ema") if optim.get(name))
-    if optim.get("tflop"):
+    part = (config.get("prerequisite") or {}).get(kind) or {}
+    if optim.get("tflop") or part.get("tflop"):
         yield "compute"
     if optim.get("precision") == "bf16":
         yield "precision.bf16"

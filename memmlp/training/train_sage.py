@@ -66,6 +66,8 @@ class SAGEPartSettings:
     """The training of one of SAGE-Net's parts, by AdamW with a weight decay of 1e-4."""
 
     steps: int = setting(at_least(1), sized(20, 2000, 188000))
+    # training compute in TFLOP, with the parts before it; it sets the number of steps. null: `steps` does
+    tflop: float | None = setting(positive(), None)
     batch: int = setting(at_least(1), sized(8, 32, 512))  # number of windows per step
     lr: float = setting(positive(), sized(1.0e-3, 1.0e-3, 1.0e-4))
     # when the learning rate drops, as fractions of the steps

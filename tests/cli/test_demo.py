@@ -37,7 +37,6 @@ def test_overrides_that_recurrent_poser_cannot_take_are_known_before_training():
     for words in (["profile=tiny", "threads=1"], ["vqvae.steps=7", "optim.steps=500"]):
         assert is_valid_for_recurrent_poser(words)
     for words in (
-        ["optim.steps=50"],  # shorter than its warm-up
         ["memory=none"],
         ["evaluation.ik=lbfgs"],
         ["predictor=rotation_only", "hand=off"],

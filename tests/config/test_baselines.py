@@ -144,3 +144,18 @@ def test_the_kinematic_loss_has_no_movements_for_a_network_that_learns_one_frame
     one, many = (compose_config([f"model={name}", "loss=kinematic"]) for name in ("ego_poser", "rpm"))
     assert [one.loss.velocity, one.loss.velocity_5] == [None, None]
     assert [many.loss.velocity, many.loss.velocity_5] == [1000.0, 250.0]
+
+
+def test_the_recipe_is_the_default_at_its_size_and_the_command_line_wins():
+    """The small Mem-MLP has the rate that a search found; the paper's size has the paper's."""
+
+    def recipe(*words: str) -> tuple[float, float]:
+        optim = compose_config(list(words)).optim
+        return optim.lr, optim.warmup
+
+    assert recipe("profile=small") == (8e-3, 0.05)
+    assert recipe("profile=small", "optim.lr=1e-3", "optim.warmup=100") == (1e-3, 100)
+    assert recipe("experiment=paper") == (3e-4, 0)
+    assert recipe("profile=paper", "profile.lr=1e-4") == (1e-4, 0)
+    with pytest.raises(InputError, match=r"profile\.lr=2e-3: has no effect"):
+        recipe("profile=small", "profile.lr=2e-3")
