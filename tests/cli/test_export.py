@@ -1,7 +1,5 @@
 """`memmlp export`: what it rejects, what it copies, and a file in fp16 for Unity."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -13,24 +11,19 @@ from types import SimpleNamespace
 import onnx
 import pytest
 import tiny
+from cli.conftest import find_trained
 from conftest import Memmlp, one_line
 from onnx import TensorProto
 
 from memmlp.cli import export as module
 from memmlp.cli.export import ExportForm
 from memmlp.common.errors import InputError
-from memmlp.runs.lookup import is_trained, list_runs
-from memmlp.runs.run import Run
 
 REJECTED = {
-    "": "--out",
-    "--out step.txt": "--out step.txt",
-    "--out none/step.onnx": "there is no folder none",
-    "--out a.onnx --rotations quaternion": "--scope full",
-    "--out a.onnx --max-growth 2": "--max-growth 2",
-    "--out a.onnx --precision int8 --scope full": "--scope step",
-    "--out a.onnx": "0123",
-}
+    "": "--out", "--out step.txt": "--out step.txt", "--out none/step.onnx": "there is no folder none",
+    "--out a.onnx --rotations quaternion": "--scope full", "--out a.onnx --max-growth 2": "--max-growth 2",
+    "--out a.onnx --precision int8 --scope full": "--scope step", "--out a.onnx": "0123",
+}  # fmt: skip
 
 
 def test_bad_options_are_rejected(memmlp: Memmlp, tmp_path, monkeypatch):
@@ -47,14 +40,9 @@ def test_an_offline_network_has_no_file():
             module.load(SimpleNamespace(network=lambda: model), ExportForm(graph, "fp32", 18, None))
 
 
-def the_run(home: Path) -> Run:
-    (run,) = (found for found in list_runs(home / "outputs") if is_trained(found))
-    return run
-
-
 @pytest.mark.slow
 def test_a_deployed_file_is_copied_without_torch(home: Path, tmp_path: Path):
-    run = the_run(home)
+    run = find_trained(home)
     code = (
         "import sys; from memmlp.cli.main import main\n"
         "try: main(sys.argv[1:])\n"
@@ -72,7 +60,7 @@ def test_a_deployed_file_is_copied_without_torch(home: Path, tmp_path: Path):
 
 @pytest.mark.slow
 def test_only_the_same_form_that_is_whole_is_copied(home: Path, tmp_path: Path):
-    run, out = the_run(home), tmp_path / "step.onnx"
+    run, out = find_trained(home), tmp_path / "step.onnx"
     deployed = run.preferred_deployment
     record, fp32 = deployed.record, ExportForm("auto", "fp32", 18, None)
     for form in (fp32, fp32._replace(graph="streaming"), fp32._replace(precision="int8")):
@@ -93,7 +81,7 @@ def test_only_the_same_form_that_is_whole_is_copied(home: Path, tmp_path: Path):
 @pytest.mark.slow
 def test_a_run_in_fp16_for_unity(home: Path, tmp_path: Path, memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
-    run = the_run(home).id
+    run = find_trained(home).id
     whole = ["--scope", "full", "--space", "unity", "--rotations", "quaternion", "--opset", "15"]
     files, write = {}, module.write_graph
 

@@ -1,8 +1,7 @@
 """`memmlp live`: what it refuses in one line, and a recording that another process ends."""
 
-from __future__ import annotations
-
 import contextlib
+import itertools
 import json
 import signal
 import subprocess
@@ -28,22 +27,17 @@ from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.synthetic import synthesize_clip
 
 REFUSED = {
-    "--height 186": "--height",
-    "--height 1.8": "--height: needs --udp PORT",
-    "--space unity": "--space unity",
-    "--hz 90 --udp 9000": "--hz",
-    "--sender 192.168.1.9": "--sender: needs --udp PORT",
-    "--udp 9001 --sender nowhere": "nowhere",
+    "--height 186": "--height", "--height 1.8": "--height: needs --udp PORT",
+    "--space unity": "--space unity", "--hz 90 --udp 9000": "--hz",
+    "--sender 192.168.1.9": "--sender: needs --udp PORT", "--udp 9001 --sender nowhere": "nowhere",
     "--udp 9001 --token a-token-of-many-letters": "--token: ",
-    "--udp 9001 --host 0.0.0.0 --token short": "--token: ",
-    "--vmc 127.0.0.1:none": "--vmc",
+    "--udp 9001 --host 0.0.0.0 --token short": "--token: ", "--vmc 127.0.0.1:none": "--vmc",
     "--clip {clip} --avatar none.vrm": "--avatar none.vrm: no such file",
-    "--clip {clip} --avatar {clip}": "--avatar",
-    "--clip {clip} --record a.fbx": "--record a.fbx",
+    "--clip {clip} --avatar {clip}": "--avatar", "--clip {clip} --record a.fbx": "--record a.fbx",
     "--clip {clip} --record {clip}": "already exists",
     "--clip {clip} --vrchat nowhere.invalid": "--vrchat nowhere.invalid",
     "--udp 9001 --calibration {clip}": "walk.npz",
-}
+}  # fmt: skip
 
 
 def test_bad_options_are_refused(memmlp: Memmlp, clip: Path, step: Path):
@@ -64,9 +58,7 @@ def step(step_files) -> Path:
     return step_files("no_memory")
 
 
-def test_python_osc_is_needed_only_by_the_options_that_use_it(
-    memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, step: Path
-):
+def test_python_osc_is_needed_only_by_the_options_that_use_it(memmlp, monkeypatch, step: Path):
     monkeypatch.setitem(sys.modules, "pythonosc", None)
     line = ["live", str(step), "--no-browser"]
     udp = ["--udp", "9001"]
@@ -107,7 +99,9 @@ def test_a_recording_is_whole_when_the_command_is_ended(step: Path, clip: Path, 
             process = running.enter_context(started([*line, "--port", "0"], **pipes))
         address = process.stdout.readline().split()[0]
         assert "me.npz, me.glb" in process.stdout.readline()
-        watch(address, 5)
+        with urllib.request.urlopen(f"{address}events", timeout=PATIENCE) as events:
+            frames = (line for line in events if line.startswith(b"event: frame"))
+            list(itertools.islice(frames, 5))
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, said
@@ -117,16 +111,7 @@ def test_a_recording_is_whole_when_the_command_is_ended(step: Path, clip: Path, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["me.glb", "me.npz"]
 
 
-def watch(address: str, frames: int) -> None:
-    with urllib.request.urlopen(f"{address}events", timeout=PATIENCE) as events:
-        seen = (line for line in events if line.startswith(b"event: frame"))
-        for _ in range(frames):
-            next(seen)
-
-
-def test_a_calibration_of_another_height_is_told(
-    step: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_calibration_of_another_height_is_told(step: Path, tmp_path: Path, capsys):
     """Its offsets are of that height, would be wrong in silence, and be kept as those of the new height."""
     stream = Stream(step)
     worn = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))

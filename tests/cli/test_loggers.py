@@ -1,7 +1,5 @@
 """`memmlp loggers sync` and `memmlp mlflow`, and training with loggers, as a person types them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

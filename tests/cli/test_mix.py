@@ -1,17 +1,14 @@
 """Two sources at once, as a person trains on them and looks at each."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from cli.conftest import write_random_clip
 from command_line import run
 
-from memmlp.motion.clip import Clip
-from memmlp.motion.formats.npz import write_clip
 from memmlp.runs.lookup import list_runs
 
 TINY = ["profile=tiny", "loggers=none", "threads=1", "optim.steps=6", "memory=none", "export.graph=off"]
@@ -19,12 +16,10 @@ TINY = ["profile=tiny", "loggers=none", "threads=1", "optim.steps=6", "memory=no
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """Two folders of clips, and a sweep on both."""
     for number, folder in enumerate(("one", "two")):
         rng = np.random.default_rng(number)
         for n in range(4):
-            poses = 0.05 * np.cumsum(rng.normal(size=(90, 22, 3)), 0)
-            write_clip(tmp_path / folder / f"{n}.npz", Clip("", poses, np.zeros((90, 3)), 60.0))
+            write_random_clip(tmp_path / folder / f"{n}.npz", rng)
     base = ["data=mocap", "data.root=[one,two]"]
     (tmp_path / "both.yaml").write_text(yaml.safe_dump({"variants": {"none": []}, "base": base}))
     return tmp_path

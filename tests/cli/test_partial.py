@@ -1,7 +1,5 @@
 """A protocol whose list isn't all there: refused, or said wherever its runs are shown."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from pathlib import Path
@@ -9,23 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from cli.conftest import write_random_clip
 from command_line import run
 
 from memmlp.config.build_request import build_motion
 from memmlp.config.compose import compose_config
-from memmlp.motion.clip import Clip
-from memmlp.motion.formats.npz import write_clip
 from memmlp.runs.lookup import list_runs
 
 TINY = [
-    "profile=tiny",
-    "loggers=none",
-    "threads=1",
-    "optim.steps=6",
-    "memory=none",
-    "data.split.val=0.2",
+    "profile=tiny", "loggers=none", "threads=1", "optim.steps=6", "memory=none", "data.split.val=0.2",
     "export.graph=off",
-]
+]  # fmt: skip
 S1 = ["data=amass_s1", "data.root=amass", "data.split.folder=lists"]
 PART = "amass_s1, 87 % of the list (7 of 8 entries), 2 of 3 subsets (without BioMotionLab_NTroje)"
 REFUSED = "data.root=amass: 1 of 8 entries of the split's list have no clip (MPI_HDM05 1 of 4)"
@@ -42,9 +34,7 @@ def home(tmp_path: Path) -> Path:
         (lists / "train_split.txt").write_text("".join(entries[:3]))
         (lists / "test_split.txt").write_text(entries[3])
         for n in range(1, 5):
-            poses = 0.05 * np.cumsum(rng.normal(size=(90, 22, 3)), 0)
-            clip = Clip("", poses, 0.01 * np.cumsum(rng.normal(size=(90, 3)), 0), 60.0)
-            write_clip(tmp_path / "amass" / now / f"0{n}" / "take_stageii.npz", clip)
+            write_random_clip(tmp_path / "amass" / now / f"0{n}" / "take_stageii.npz", rng)
     (tmp_path / "amass" / "HDM05" / "02" / "take_stageii.npz").unlink()
     (tmp_path / "s1.yaml").write_text(yaml.safe_dump({"variants": {"none": []}, "base": ["memory=none"]}))
     return tmp_path
@@ -66,9 +56,6 @@ def test_a_plan_that_was_made_for_a_look_is_no_way_round(home):
     words = ["sweep", "s1.yaml", *TINY, *S1]
     assert "prepared" not in run(home, *words, "--status")  # the plan is kept
     assert REFUSED in run(home, *words, "--workers", "1", code=2)
-
-
-def test_data_prepare_shows_the_gap(home):
     words = ("data=amass_s1", "data.split.folder=lists", "data.split.val=0.2")
     said = run(home, "data", "prepare", "amass", *words, "--out", "cache")
     assert "87 % of the list (7 of 8 entries): 1 of 8 entries" in " ".join(said.split())

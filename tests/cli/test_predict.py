@@ -1,7 +1,5 @@
 """`memmlp predict`: a run's predictions as files of other programs."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import command_line
 import numpy as np
 import pytest
+from cli.conftest import find_trained
 
 from memmlp.common.files import write_json
 from memmlp.config.open_run import open_run
@@ -16,7 +15,6 @@ from memmlp.evaluation.predictions import predict_clip
 from memmlp.motion.body import describe_body
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
-from memmlp.runs.lookup import is_trained, list_runs
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +27,7 @@ def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(home: Path) -> str:
-    (only,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
-    return only
+    return find_trained(home).id
 
 
 @pytest.fixture(scope="module")
@@ -78,16 +75,15 @@ def test_foreign_clips_need_the_run_alone(home: Path, run: str, tmp_path: Path):
     (tmp_path / "clips" / "bad.npz").write_bytes(b"none")
     said = command_line.run(tmp_path, "predict", run, "clips", "--out", "out", "--format", "gltf")
     assert "skipped bad.npz: " in said
-    assert names(tmp_path / "out", "glb") == names(tmp_path / "clips", "npz") - {"bad"} != set()
+    made = {file.relative_to(tmp_path / "out").with_suffix("") for file in (tmp_path / "out").rglob("*.glb")}
+    clips = {
+        file.relative_to(tmp_path / "clips").with_suffix("") for file in (tmp_path / "clips").rglob("*.npz")
+    }
+    assert made == clips - {Path("bad")} != set()
     assert not (tmp_path / "outputs" / "cache").exists()
     write_json(tmp_path / "clips" / "import.json", describe_body("model.npz", np.ones((22, 3))))
     line = command_line.run(tmp_path, "predict", run, "clips", "--out", "b", "--format", "gltf", code=2)
     assert "imported for the body model.npz" in line
-
-
-def names(folder: Path, suffix: str) -> set[str]:
-    files = folder.rglob(f"*.{suffix}")
-    return {file.relative_to(folder).as_posix().removesuffix(f".{suffix}") for file in files}
 
 
 REFUSED = {

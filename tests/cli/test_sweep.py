@@ -1,7 +1,5 @@
 """`memmlp sweep` as a person types it, on tiny runs."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -16,11 +14,9 @@ from command_line import BRIEF, run
 from processes import PATIENCE, forked, until
 
 from memmlp.cli.main import main
-from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep, make_plan
 from memmlp.config.worker_process import perform_task
-from memmlp.runs.identity import VERSIONS, find_version
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 from memmlp.sweep.progress_table import describe_task
@@ -52,9 +48,8 @@ def stamps(folder: Path) -> dict[str, int]:
 
 def test_what_can_be_done_is_done_once(home: Path):
     said = (home / "first.txt").read_text()
-    assert "3 of 4 runs done" in said
-    assert "wild seed 0: failed, loss is nan" in said
-    assert "MPJPE" in said
+    for words in ("3 of 4 runs done", "wild seed 0: failed, loss is nan", "MPJPE"):
+        assert words in said
     assert [re.search(rf"^{variant} +(./1)", said, re.M)[1] for variant in VARIANTS] == ["1/1", "1/1", "0/1"]
     runs = list_runs(home / "outputs")
     assert sorted(run.manifest["kind"] for run in runs if run.done) == ["memmlp", "memmlp", "vqvae"]
@@ -66,10 +61,8 @@ def test_what_can_be_done_is_done_once(home: Path):
 
 
 def test_status_and_dry_run_show_and_do_nothing(home: Path):
-    before = stamps(home)
+    before, folders = stamps(home), sorted((home / "outputs" / "sweeps").iterdir())
     said = command(home, "--status")
-    assert "full" in said
-    assert "failed" in said
     assert "3 done, 1 failed" in said
     assert said.startswith(f"overrides: {' '.join(TINY)}")
     assert "has changed since" not in said
@@ -78,20 +71,16 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     )
     sources = older.manifest["sources"]
     older.write_manifest({"sources": sources | {"training/loop.py": "0" * 12}})
-    line = (
-        "code of training/loop.py has changed since these runs, under the same component versions: 'none'\n"
-    )
-    assert line in command(home, "--status")
+    assert re.search(r"training/loop.py has changed since.*: 'none'\n", command(home, "--status"))
     older.write_manifest({"sources": sources})
     forecast = command(home, "seed=0,1", "--dry-run", "--workers", "2")
     assert "4 of 8 runs to do, 2 at once: about" in forecast
     words = ("executor=slurm", "slurm.partition=gpu", "slurm.time=10:00:00", "slurm.mem_gb=8")
     slurm = command(home, "--dry-run", *words, "--workers", "3")
-    assert "#SBATCH --array=0-2%3" in slurm
-    assert "#SBATCH --time=10:00:00" in slurm
-    assert "#SBATCH --partition=gpu" in slurm
-    assert "#SBATCH --mem=8GB" in slurm
-    assert stamps(home) == before
+    for line in ("array=0-2%3", "time=10:00:00", "partition=gpu", "mem=8GB"):
+        assert f"#SBATCH --{line}" in slurm
+    assert "waiting" in command(home, "seed=7", "optim.weight_decay=0.1", "--status")
+    assert (stamps(home), sorted((home / "outputs" / "sweeps").iterdir())) == (before, folders)
 
 
 def test_variants_that_are_named_are_run_alone(home: Path):
@@ -120,18 +109,14 @@ def test_a_first_dry_run_counts_the_runs_whose_data_is_not_prepared(tmp_path: Pa
 
 def test_seeds_come_one_after_another_each_with_all_variants(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
-    plan = make_plan(
-        find_sweep("trial.yaml").with_overrides([*TINY, "seed=1,0"]), (home / "outputs").absolute()
-    )
+    outputs = (home / "outputs").absolute()
+    plan = make_plan(find_sweep("trial.yaml").with_overrides([*TINY, "seed=1,0"]), outputs)
     cells = [(entry.seed, entry.label) for entry in plan.entries]
     assert cells == [(seed, variant) for seed in (1, 0) for variant in VARIANTS]
-    own = [task.id for task in plan.tasks if task.kind == "memmlp"]
-    assert own == [entry.id for entry in plan.entries]
-    for task in plan.tasks:
-        assert task.prerequisite is None or task.prerequisite in [
-            other.id for other in plan.tasks[: plan.tasks.index(task)]
-        ]
-    (codes,) = (task for task in plan.tasks if task.kind == "vqvae" and task.id == plan.tasks[0].id)
+    assert [task.id for task in plan.tasks if task.kind == "memmlp"] == [entry.id for entry in plan.entries]
+    for number, task in enumerate(plan.tasks):
+        assert task.prerequisite in (None, *(other.id for other in plan.tasks[:number]))
+    codes = plan.tasks[0]
     assert describe_task(plan, codes).startswith(f"VQ-VAE {codes.id} of seed ")
     said = command(home, "seed=1,0", "--status")
     assert re.search(r"variant +seed 0 +seed 1", said)
@@ -146,9 +131,7 @@ def test_retry_takes_failed_runs_up_again(home: Path):
     assert failed.failure is not None
 
 
-def test_again_does_networks_again_and_force_is_refused(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_again_does_networks_again_and_force_is_refused(home: Path, tmp_path: Path, monkeypatch):
     """With force=true two variants that share a run would make each other's stages again and again."""
     copy = Path(shutil.copytree(home, tmp_path / "copy"))
     left = []
@@ -163,16 +146,7 @@ def test_again_does_networks_again_and_force_is_refused(
     assert "force=true: " in command(copy, "force=true", code=2)
 
 
-def test_a_look_at_a_sweep_that_was_never_started_leaves_nothing(home: Path):
-    folders = sorted((home / "outputs" / "sweeps").iterdir())
-    assert "waiting" in command(home, "seed=7", "optim.weight_decay=0.1", "--status")
-    command(home, "seed=7", "optim.weight_decay=0.1", "--dry-run")
-    assert sorted((home / "outputs" / "sweeps").iterdir()) == folders
-
-
-def test_a_look_at_other_seeds_or_without_the_data_leaves_a_sweep_as_it_was(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_look_at_other_seeds_or_without_the_data_leaves_a_sweep_as_it_was(home, tmp_path, monkeypatch):
     """Its runs must not look orphaned, which `memmlp runs gc` deletes."""
     copy = Path(shutil.copytree(home, tmp_path / "copy"))
     monkeypatch.chdir(copy)
@@ -197,21 +171,18 @@ def as_typed(folder: Path, *arguments: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ending", "words"), [(signal.SIGINT, ("--workers", "1")), (signal.SIGTERM, ("executor=debug",))]
-)
-def test_an_interrupted_sweep_ends_its_workers(tmp_path: Path, ending: int, words: tuple[str, ...]):
-    """By Ctrl-C with a worker, or by a scheduler's signal where the command does the work itself."""
+def test_an_interrupted_sweep_ends_its_workers(tmp_path: Path):
+    """By a scheduler's signal, which is handled as Ctrl-C is."""
     write(tmp_path, {"none": ["memory=none"]})
     file = tmp_path / "said.txt"
     file.touch()
-    words = ("sweep", "trial.yaml", *TINY, "optim.steps=100000", *words)
+    words = ("sweep", "trial.yaml", *TINY, "optim.steps=100000", "--workers", "1")
     with forked(as_typed, tmp_path, *words, said=str(file)) as process:
         begun = lambda: any(run.step for run in list_runs(tmp_path / "outputs"))  # noqa: E731
         until(begun, "the run's first steps", process)
         run = list_runs(tmp_path / "outputs")[0]
         assert run.activity
-        os.kill(process.pid, ending)
+        os.kill(process.pid, signal.SIGTERM)
         left, said = process.wait(PATIENCE), file.read_text()
     assert left == 130, said
     assert "interrupted" in said
@@ -220,8 +191,7 @@ def test_an_interrupted_sweep_ends_its_workers(tmp_path: Path, ending: int, word
 
 
 BAD_INPUT: list[tuple[list[str], str]] = [
-    (["nosuch"], "sweep 'nosuch': no such sweep"),
-    (["missing.yaml"], "missing.yaml: no such file"),
+    (["nosuch"], "sweep 'nosuch': no such sweep"), (["missing.yaml"], "missing.yaml: no such file"),
     (["trial.yaml", "memory=nosuch"], "memory=nosuch"),
     (["trial.yaml", "--variant", "non"], "sweep trial: no variant 'non'"),
     (["trial.yaml", "--variant", "none", "--until-decided"], "--variant: "),
@@ -230,10 +200,9 @@ BAD_INPUT: list[tuple[list[str], str]] = [
     (["trial.yaml", "executor=slurm", "slurm.nodes=2"], "slurm.nodes: "),
     (["trial.yaml", "executor=ray", "ray.gpus=1"], "ray.gpus: no such key"),
     (["trial.yaml", "executor=ray", "--gpus-per-worker", "1"], "--gpus-per-worker: "),
-    (["trial.yaml", "device=cuda:x"], "device=cuda:x: "),
-    (["trial.yaml", "seed=a"], "seed: ['a']"),
+    (["trial.yaml", "device=cuda:x"], "device=cuda:x: "), (["trial.yaml", "seed=a"], "seed: ['a']"),
     (["trial.yaml", "data=mocap"], "variant 'full': data.root: has no value"),
-]
+]  # fmt: skip
 
 
 def test_bad_input_is_one_line(tmp_path: Path):
@@ -244,19 +213,9 @@ def test_bad_input_is_one_line(tmp_path: Path):
         assert said.count("\n") == 1
 
 
-def test_executor_words_are_no_overrides_of_the_runs():
-    assert split_executor(("executor=slurm", "slurm.time=5", "model.depth=8")) == (
-        "slurm",
-        {"time": "5"},
-        ("model.depth=8",),
-    )
-    with pytest.raises(InputError, match="executor"):
-        split_executor(("executor=",))
-
-
-@pytest.mark.parametrize("name", ["14", "table14", "04", "4", "memory_control"])
-def test_shipped_sweeps_are_found_by_name_and_number(name: str):
-    assert find_sweep(name).name in ("table14", "table04", "memory_control")
+def test_shipped_sweeps_are_found_by_name_and_number():
+    names = {"14": "table14", "table14": "table14", "04": "table04", "4": "table04", "mix": "mix"}
+    assert {name: find_sweep(name).name for name in names} == names
 
 
 def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeypatch: pytest.MonkeyPatch):
@@ -266,9 +225,3 @@ def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeyp
     with pytest.raises(InputError, match="the data or the code has changed"):
         perform_task(home / "plan.json", 1, plan, other)
     assert not plan.get_run(other).folder.exists()
-
-
-def test_runs_with_another_component_version_are_missing(home: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(VERSIONS, "memory.none", find_version("memory.none") + 1)
-    said = run(home, "table", "trial.yaml", *TINY, "optim.log_every=3")  # a new plan with the same results
-    assert "missing: 'none' seed 0, 'wild' seed 0" in " ".join(said.split())

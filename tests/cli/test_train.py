@@ -1,7 +1,5 @@
 """`memmlp train`: what its jobs leave to each other."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from omegaconf import DictConfig

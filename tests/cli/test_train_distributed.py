@@ -1,7 +1,5 @@
 """`torchrun -m memmlp train`: one run by two processes."""
 
-from __future__ import annotations
-
 import os
 from contextlib import ExitStack
 from pathlib import Path

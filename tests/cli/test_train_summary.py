@@ -1,7 +1,5 @@
 """What `memmlp train` says of a network's size and times."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,17 +35,15 @@ def test_tables_of_sources_are_of_the_evaluation_that_is_shown(tmp_path: Path):
         assert abs(thrice - 3 * once) < 0.03
 
 
-def test_brackets_in_a_folders_name_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    run = fake_run(tmp_path / "[old]", "a")
+@pytest.mark.parametrize(("steps", "told"), [(2000, False), (20, True)])
+def test_a_network_that_hardly_saw_motion_says_so(tmp_path: Path, capsys, steps: int, told: bool):
+    """Brackets in a folder's name are shown."""
+    config = {"optim": {"steps": steps, "batch": 8}, "model": {"frames": 11}}
+    run = fake_run(tmp_path / "[old]", "a", config=config)
     show(Outcome(run, (), {}, ()))
-    assert f"run      {run.folder}\n" in capsys.readouterr().out
-
-
-def test_a_network_that_hardly_saw_motion_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    for steps, told in ((2000, False), (20, True)):
-        config = {"optim": {"steps": steps, "batch": 8}, "model": {"frames": 11}}
-        show(Outcome(fake_run(tmp_path, f"of {steps}", config=config), (), {}, ()))
-        assert ("hardly trained" in capsys.readouterr().out) == told
+    said = capsys.readouterr().out
+    assert ("hardly trained" in said) == told
+    assert f"run      {run.folder}\n" in said
 
 
 TIMES = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2}
@@ -61,15 +57,12 @@ def test_times_and_size_are_those_of_the_file_that_was_asked_for():
     own = {"median_ms": 1.27, "p95_ms": 1.4, "ratio_to_yardstick": 0.45, "onnx_bytes": 600_000}
     said = latency({"settings": {"precision": "int8"}, "int8": own})
     for words in (
-        "1.27 ms median",
-        "1.40 ms p95",
-        "0.45 x",
-        "fp32 3.39 ms",
-        "ONNX file 0.6 MB",
-        "0.218 MMAC",
-    ):
+        "1.27 ms median", "1.40 ms p95", "0.45 x", "fp32 3.39 ms", "ONNX file 0.6 MB", "0.218 MMAC",
+    ):  # fmt: skip
         assert words in said
     assert "available 31% of the time" not in said
+    for key in ("core_share", "alone_core_share", "pose_core_share"):
+        assert "available 31% of the time" in latency({key: 0.31})
 
 
 def test_an_int8_file_that_is_not_used_live_is_told():
@@ -77,11 +70,6 @@ def test_an_int8_file_that_is_not_used_live_is_told():
         cost = TIMES | {"onnx_bytes": 600_000, "growth": 0.0016, "jitter_growth": jitter}
         said = latency({"settings": {"precision": "int8"}, "int8": cost})
         assert ("Jitter +35.6%" in said) == ("memmlp live uses float32" in said) == (jitter > 0.1)
-
-
-def test_times_of_a_busy_machine_say_so():
-    for key in ("core_share", "alone_core_share", "pose_core_share"):
-        assert "available 31% of the time" in latency({key: 0.31})
 
 
 def test_side_by_side_shows_each_branch_that_differs(capsys: pytest.CaptureFixture[str]):

@@ -1,7 +1,5 @@
 """`memmlp tune` as a person types it, on tiny runs, calm and under SIGKILLs."""
 
-from __future__ import annotations
-
 import csv
 import re
 import shlex
@@ -24,14 +22,20 @@ from memmlp.sweep.search.search_file import Range
 from memmlp.sweep.search.study import Study
 
 TINY = [*BRIEF, "optim.validate_every=3"]
+TRIALS = ["memory=none", "search.n_trials=2", "search.seeds=2"]
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run a search of three trials in a folder of its own."""
+    """Run a search of two trials, each of two seeds, in a folder of its own."""
     folder = tmp_path_factory.mktemp("tune")
-    (folder / "said.txt").write_text(run_apart(folder, "tune", *TINY, "search.n_trials=3", "--workers", "1"))
+    (folder / "said.txt").write_text(run_apart(folder, "tune", *TINY, *TRIALS, "--workers", "1"))
     return folder
+
+
+def read_trials(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "trials.csv", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def folder_of(home: Path) -> Path:
@@ -40,64 +44,51 @@ def folder_of(home: Path) -> Path:
 
 
 def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
+    """A trial's value is the mean of its two seeds."""
     said = (home / "said.txt").read_text()
-    assert "3 of 3 trials: 3 complete" in said
-    assert "importance: needs 25 complete trials; with 3 it would be chance" in said
-    rows = list(csv.DictReader((folder_of(home) / "trials.csv").read_text().splitlines()))
-    assert rows[0]["loss.rotation_velocity"] == "30.0"
-    assert examine(home / "outputs", 3) == []
+    assert "2 of 2 trials: 2 complete" in said
+    assert "importance: needs 25 complete trials" in said
+    rows = read_trials(folder_of(home))
+    assert (rows[0]["loss.rotation_velocity"], examine(home / "outputs", 2)) == ("30.0", [])
     best = min(rows, key=lambda row: float(row["MPJPE"]))
+    assert f"{float(best['MPJPE']):.3f} ± {float(best['MPJPE sd']):.3f}" in said
+    first, second = best["run"].split()
+    assert Run.from_id(home / "outputs", second).config["seed"] == 1
     (words,) = re.findall(r"next: memmlp (.*)", said)
-    trained = command(home, *shlex.split(words), "export.graph=off")
-    assert f"outputs/runs/{best['run']}" in trained
-    assert len(list((home / "outputs/runs").iterdir())) == 4  # a VQ-VAE and three trials, none made anew
+    assert f"outputs/runs/{first}" in command(home, *shlex.split(words), "export.graph=off")
+    assert len(list((home / "outputs/runs").iterdir())) == 4  # none made anew
 
 
 def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
     before = (folder_of(home) / "study.journal").read_bytes()
-    again = command(home, "tune", *TINY, "search.n_trials=3")
-    assert "3 of 3 trials: 3 complete" in again
-    assert "3 of 3 trials: 3 complete" in command(home, "tune", *TINY, "search.n_trials=3", "--status")
+    for words in ([], ["--status"]):
+        assert "2 of 2 trials: 2 complete" in command(home, "tune", *TINY, *TRIALS, *words)
     assert "not started" in command(home, "tune", *TINY, "search.seed=5", "--status")
     assert (folder_of(home) / "study.journal").read_bytes() == before
 
 
-def test_a_trial_of_two_seeds_goes_on_from_a_search_of_one(home: Path, tmp_path: Path):
-    """The first trial's first run is that of a search with one seed; its other run has the next seed."""
-    shutil.copytree(home / "outputs/runs", tmp_path / "outputs/runs")
-    shutil.copytree(home / "outputs/data", tmp_path / "outputs/data", copy_function=shutil.copy2)
-    words = ["search.n_trials=1", "search.seeds=2", "--workers", "1"]
-    said = run_apart(tmp_path, "tune", *TINY, *words)
+def test_searches_of_one_and_of_two_seeds_share_the_first_seeds_runs(home: Path, tmp_path: Path):
+    for name in ("runs", "data", "cache"):
+        shutil.copytree(home / "outputs" / name, tmp_path / "outputs" / name, copy_function=shutil.copy2)
+    said = command(tmp_path, "tune", *TINY, "memory=none", "search.n_trials=1", "--workers", "1")
     assert "1 of 1 trials: 1 complete" in said
-    (before,) = list(csv.DictReader((folder_of(home) / "trials.csv").read_text().splitlines()))[:1]
-    (row,) = csv.DictReader((folder_of(tmp_path) / "trials.csv").read_text().splitlines())
-    first, second = row["run"].split()
-    assert first == before["run"]
-    assert Run.from_id(tmp_path / "outputs", second).config["seed"] == 1
-    assert row["MPJPE, run 1"] == before["MPJPE"]
-    assert float(row["MPJPE"]) == (float(row["MPJPE, run 1"]) + float(row["MPJPE, run 2"])) / 2
-    assert f"{float(row['MPJPE']):.3f} ± {float(row['MPJPE sd']):.3f}" in said
-    assert "1 complete" in command(tmp_path, "tune", *TINY, *words[:2], "--status")
+    (row,), two = read_trials(folder_of(tmp_path)), read_trials(folder_of(home))[0]
+    assert (row["run"], row["MPJPE"]) == (two["run"].split()[0], two["MPJPE, run 1"])
 
 
 BAD_SEARCHES = {
-    "search.n_trial=3": "n_trial",
-    "search.n_trials=0": "search.n_trials=0: ",
-    "search=losses": "losses",
+    "search.n_trial=3": "n_trial", "search.n_trials=0": "search.n_trials=0: ", "search=losses": "losses",
     "search.space.loss.rotation_all.low=-1": "search.space.loss.rotation_all.low=-1: ",
     "+search.space.optim.lrr={low: 0.1, high: 1.0}": "optim.lrr",
     "+search.space.optim.batch={low: -4, high: 8}": "search.space: optim.batch=-4: ",
-    "optim.lr=-1": "memmlp: optim.lr=-1",
-    "loss.rotation_all=5": "loss.rotation_all=5: is searched",
+    "optim.lr=-1": "memmlp: optim.lr=-1", "loss.rotation_all=5": "loss.rotation_all=5: is searched",
     "+search.space.memory.blend={low: 0.0, high: 1.0}": "search.space.memory.blend: ",
     "+search.space.data.split.seed={low: 0, high: 9}": "search.space: data.split.seed changes ",
     "+search.space.data={choices: [synth, mocap], first: synth}": "search.space: ",
-    "~search": "search: must be the name",
-    "~search.n_trials": "search.n_trials: has no value",
-    "+search.nonsense=1": "search.nonsense: no such key",
-    "executor=cloud": "executor=cloud: ",
+    "~search": "search: must be the name", "~search.n_trials": "search.n_trials: has no value",
+    "+search.nonsense=1": "search.nonsense: no such key", "executor=cloud": "executor=cloud: ",
     "executor=debug": "executor=debug: ",
-}
+}  # fmt: skip
 
 
 def test_bad_searches_are_refused_before_anything_runs(tmp_path: Path):
@@ -128,11 +119,6 @@ def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path, mon
     assert len({base, *others}) == 11
 
 
-def test_what_is_trained_on_alone_may_be_searched(tmp_path: Path):
-    space = ["search.space.loss=null", "+search.space.data.split.train_fraction={low: 0.5, high: 1.0}"]
-    assert prepare_search([*TINY, *space], None, tmp_path).search.space[0].key == "data.split.train_fraction"
-
-
 def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Further trials would be judged by other clips than those before, and ranked with them."""
     command(tmp_path, "data", "synth", "--out", "mine", "--minutes", "2")
@@ -152,56 +138,44 @@ def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytes
     assert len(study.trials) == 1
 
 
-def test_a_search_is_named_after_what_later_trials_follow_from_too(tmp_path: Path):
-    """The first trial has no memory, and so no VQ-VAE."""
+def test_a_search_is_named_after_what_later_trials_follow_from_too(tmp_path: Path, monkeypatch):
+    """The first trial has no memory, and so no VQ-VAE; a component that no trial uses changes nothing."""
     space = ["search.space.loss=null", "+search.space.memory={choices: [none, vq], first: none}"]
 
     def folder(*words: str) -> str:
         return prepare_search([*TINY, *space, *words], None, tmp_path).folder.name
 
-    assert folder("vqvae.lr=1e-3") != folder("vqvae.lr=1e-1")
-
-
-def test_another_recipe_of_what_later_trials_use_makes_another_search(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Trials before it were judged by other code; a component that no trial uses changes nothing."""
-    space = ["search.space.loss=null", "+search.space.memory={choices: [none, vq], first: none}"]
-    before = prepare_search([*TINY, *space], None, tmp_path).folder.name
+    before = folder()
+    assert folder("vqvae.lr=1e-1") != before
     for component, same in {"memory.gru": True, "memory.vq": False, "codebook.ema": False}.items():
         with monkeypatch.context() as patched:
             patched.setitem(VERSIONS, component, 99)
-            assert (prepare_search([*TINY, *space], None, tmp_path).folder.name == before) == same
+            assert (folder() == before) == same
 
 
 def test_a_folder_of_ones_own_searches(tmp_path: Path):
-    """Of a learning rate and of a warm-up, which changes no training where it is 0, as it is in the base."""
+    """Of keys that change nothing in the base (a warm-up of 0), and of training data."""
     (tmp_path / "own/search").mkdir(parents=True)
-    space = "space: {loss: null, optim: {lr: {low: 1.0e-4, high: 0.1}, warmup: {low: 0, high: 3}}}"
+    space = "space: {loss: null, optim: {warmup: {low: 0, high: 3}}}"
     text = f"defaults: [loss_weights, _self_]\nname: rates\nbase: []\n{space}\n"
     (tmp_path / "own/search/rates.yaml").write_text(text)
-    setup = prepare_search([*TINY, "search=rates"], tmp_path / "own", tmp_path)
-    assert [one.key for one in setup.search.space] == ["optim.lr", "optim.warmup"]
+    data = "+search.space.data.split.train_fraction={low: 0.5, high: 1.0}"
+    setup = prepare_search([*TINY, "search=rates", data], tmp_path / "own", tmp_path)
+    assert [one.key for one in setup.search.space] == ["optim.warmup", "data.split.train_fraction"]
     assert setup.folder.name.startswith("rates-")
 
 
 def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
     outputs = tmp_path / "outputs"
     shutil.copytree(home / "outputs", outputs)
-    (folder,) = (outputs / "tune").iterdir()
-    text = (folder / "trials.csv").read_text()
-    rows = text.splitlines()
-    (folder / "trials.csv").write_text(
-        "\n".join([*rows[:3], rows[2], rows[3].replace("complete", "running")])
-    )
-    said = "\n".join(examine(outputs, 3))
-    assert "4 trials, not 3" in said
-    assert "of 2 trials" in said
-    assert "trial 2: running" in said
-    (folder / "trials.csv").write_text("\n".join([rows[0], re.sub(r",\d", ",9", rows[1], count=1), rows[2]]))
+    path = next((outputs / "tune").iterdir()) / "trials.csv"
+    head, first, second = path.read_text().splitlines()
+    path.write_text("\n".join([head, first, first, second.replace("complete", "running")]))
     said = "\n".join(examine(outputs, 2))
-    assert "trial 0: not the mean of its runs" in said
-    assert "of no trial" in said
+    assert all(words in said for words in ("3 trials, not 2", "of 2 trials", "trial 1: running"))
+    path.write_text("\n".join([head, re.sub(r",\d", ",9", first, count=1)]))
+    said = "\n".join(examine(outputs, 1))
+    assert all(words in said for words in ("trial 0: not the mean of its runs", "of no trial"))
 
 
 @pytest.mark.slow
@@ -210,15 +184,9 @@ def test_every_trial_trains_for_the_same_compute(network: str, tmp_path: Path):
     """The batch is searched, and so is the number of steps; the objective is of the best validation."""
     budget, own = 0.005, [word for word in TINY if "steps" not in word and "validate" not in word]
     space = ["search.space.optim=null", "+search.space.optim.batch={choices: [4, 8]}"]
-    words = [
-        f"model={network}",
-        "search=learning_rate",
-        *space,
-        "search.n_trials=2",
-        f"search.tflop={budget}",
-    ]
-    run_apart(tmp_path, "tune", *own, *words, "--workers", "1")
-    rows = list(csv.DictReader((folder_of(tmp_path) / "trials.csv").read_text().splitlines()))
+    words = [f"model={network}", "search=learning_rate", "search.n_trials=2", f"search.tflop={budget}"]
+    run_apart(tmp_path, "tune", *own, *words, *space, "--workers", "1")
+    rows = read_trials(folder_of(tmp_path))
     runs = [Run.from_id(tmp_path / "outputs", row["run"]) for row in rows]
     assert [run.manifest["tflop"] for run in runs] == pytest.approx([budget, budget], rel=0.05)
     assert runs[0].total_steps > 1.4 * runs[1].total_steps

@@ -1,7 +1,5 @@
 """`memmlp web`: what it makes of a run, and what it refuses before it computes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,11 +7,11 @@ from types import SimpleNamespace
 import command_line
 import pytest
 import tiny
+from cli.conftest import find_trained
 
 from memmlp.cli.web import describe_network
 from memmlp.common.errors import InputError
 from memmlp.common.npm import ONNXRUNTIME_WEB, fetch_tarball
-from memmlp.runs.lookup import is_trained, list_runs
 
 pytestmark = pytest.mark.slow
 
@@ -23,7 +21,7 @@ def test_a_site_to_play_and_wear(home: Path):
         fetch_tarball(ONNXRUNTIME_WEB)
     except InputError as error:
         pytest.skip(str(error))
-    (run,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
+    run = find_trained(home).id
     words = ("web", run[:6], "--out", "site", "--clips", "2", "--seconds", "1")
     said = command_line.run(home, *words)
     assert "python -m http.server --directory site" in said
@@ -46,9 +44,11 @@ def test_a_network_that_makes_frames_with_later_ones_is_on_no_site():
 
 
 def test_what_it_refuses(home: Path):
-    (run,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
-    said = command_line.run(home, "web", run, run[:5], "--out", "site", code=2)
-    assert "only once" in said
-    assert "other content" in command_line.run(home, "web", run, "--out", "outputs", code=2)
-    assert "first digits" in command_line.run(home, "web", "zzz", "--out", "site", code=2)
+    run = find_trained(home).id
+    for words, line in (
+        ([run, run[:5], "--out", "site"], "only once"),
+        ([run, "--out", "outputs"], "other content"),
+        (["zzz", "--out", "site"], "first digits"),
+    ):
+        assert line in command_line.run(home, "web", *words, code=2)
     assert not (home / "site").exists()

@@ -1,8 +1,7 @@
 """What the command line says of workers, and what they do without the GPU that they were to have."""
 
-from __future__ import annotations
-
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -20,35 +19,26 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "describe_missing_gpu", lambda: None)
 
 
-@pytest.mark.parametrize(
-    ("visible", "options", "wanted", "shares", "number"),
-    [
-        ("0,1", {}, ["auto"], [("0",), ("1",)], 2),
-        ("0,1", {"count": 4}, ["auto", "cpu"], [("0",), ("1",)], 4),
-        ("0,1", {"workers_per_gpu": 3}, ["cuda"], [("0",), ("1",)], 6),
-        ("0,1,2", {"gpus_per_worker": 2}, ["cuda"], [("0", "1")], 1),
-        ("0,1", {"gpus_per_worker": 0, "count": 3}, ["auto"], [], 3),
-        ("0,1", {"count": 3}, ["cpu"], [], 3),
-        ("", {"count": 3}, ["auto"], [], 3),
-        ("0,1", {"executor": "ray", "count": 3}, ["cuda"], [], 3),
-    ],
-)
+@pytest.mark.parametrize(("visible", "options", "wanted", "shares", "number"), [
+    ("0,1", {}, ["auto"], [("0",), ("1",)], 2),
+    ("0,1", {"count": 4}, ["auto", "cpu"], [("0",), ("1",)], 4),
+    ("0,1", {"workers_per_gpu": 3}, ["cuda"], [("0",), ("1",)], 6),
+    ("0,1,2", {"gpus_per_worker": 2}, ["cuda"], [("0", "1")], 1),
+    ("0,1", {"gpus_per_worker": 0, "count": 3}, ["auto"], [], 3), ("0,1", {"count": 3}, ["cpu"], [], 3),
+    ("", {"count": 3}, ["auto"], [], 3), ("0,1", {"executor": "ray", "count": 3}, ["cuda"], [], 3),
+])  # fmt: skip
 def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, number):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     workers = Workers(**options)
-    assert workers.make_gpu_shares(wanted) == shares
-    assert workers.count_workers(shares) == number
+    assert (workers.make_gpu_shares(wanted), workers.count_workers(shares)) == (shares, number)
 
 
-@pytest.mark.parametrize(
-    ("wanted", "visible", "executor", "line"),
-    [
-        ("cuda:1", "0,1", "local", "device=cuda:1"),
-        ("cuda:1", "", "ray", "device=cuda:1"),
-        ("cuda", "", "local", "device=cuda: no GPU is visible here"),
-        ("auto", "0", "local", "torch .* does not find one"),
-    ],
-)
+@pytest.mark.parametrize(("wanted", "visible", "executor", "line"), [
+    ("cuda:1", "0,1", "local", "device=cuda:1"),
+    ("cuda:1", "", "ray", "device=cuda:1"),
+    ("cuda", "", "local", "device=cuda: no GPU is visible here"),
+    ("auto", "0", "local", "torch .* does not find one"),
+])  # fmt: skip
 def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, visible, executor, line):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
@@ -70,28 +60,20 @@ def test_settings_belong_to_one_executor():
     assert Workers(executor, own).parse_options() == {"address": "head:1", "resources": {"big": 2.0}}
     with pytest.raises(InputError, match=f"{name}.address: needs executor={name}"):
         split_executor(words[1:])
+    with pytest.raises(InputError, match="executor"):
+        split_executor(("executor=",))
 
 
-class Shelf:
-    """An executor that starts nothing."""
-
-    def __init__(self, gpus: bool):
-        self.gpus = gpus
-
-
-@pytest.mark.parametrize(
-    ("executor", "gives", "wanted", "gpu"),
-    [
-        ("local", True, ["auto"], True), ("local", False, ["auto"], False), ("ray", True, ["cuda"], True),
-        ("ray", True, ["cpu"], False), ("ray", True, ["cpu", "auto"], True),
-        ("ray", False, ["auto"], False),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("executor", "gives", "wanted", "gpu"), [
+    ("local", True, ["auto"], True), ("local", False, ["auto"], False), ("ray", True, ["cuda"], True),
+    ("ray", True, ["cpu"], False), ("ray", True, ["cpu", "auto"], True),
+    ("ray", False, ["auto"], False),
+])  # fmt: skip
 def test_workers_know_whether_they_are_to_have_a_gpu(
     found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor, gives, wanted, gpu
 ):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0" if gives else "")
-    monkeypatch.setattr(Workers, "start_executor", lambda *_, **__: Shelf(gives))
+    monkeypatch.setattr(Workers, "start_executor", lambda *_, **__: SimpleNamespace(gpus=gives))
     path, fleet = start_fleet(tmp_path, Plan("s", tmp_path, (), ()), Workers(executor, count=1), wanted)
     assert fleet.work.args[-1] is gpu
     monkeypatch.setattr(devices, "describe_missing_gpu", lambda: "none is there")

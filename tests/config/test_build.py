@@ -1,7 +1,8 @@
 """Every option of every group trains, streams and differs from its base; every kind of graph exports."""
 
-from __future__ import annotations
-
+import contextlib
+import functools
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, NamedTuple
@@ -9,7 +10,6 @@ from typing import Any, NamedTuple
 import pytest
 import tiny
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import compose_config
@@ -26,22 +26,16 @@ TINY = [
     "profile=tiny", "data.synth.minutes=0.1", "loggers=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
     "optim.batch=4", "model.width=8", "memory.width=4", "vqvae.width=8", "evaluation.ik_iterations=2",
 ]  # fmt: skip
-SMALL = [
-    "model.frames=5",
-    "model.depth=2",
-    "memory.layers=[2]",
-    "predictor.depth=1",
-]  # where the axis is none of them
+SMALL = ["model.frames=5", "model.depth=2", "memory.layers=[2]", "predictor.depth=1"]  # unless an axis
 
 # By axis: the keys beside it and its values, the first of which is the base. What follows a comma is no key.
 # Keys with numbers are changed in tests/training/test_experiment.py.
-ROLLOUTS = "teacher_forcing own_predictions streams"
 TRAINED: dict[str, tuple[list[str], str]] = {
     "memory": (SMALL, "vq no_codes none vq_joint lstm gru"),
     "predictor": (
         [*SMALL, "hand=fk"], "two_branch two_branch_memory rotation_only rotation_only_memory"
     ),
-    "rollout": (SMALL, ROLLOUTS),
+    "rollout": (SMALL, "teacher_forcing own_predictions streams"),
     "loss": (SMALL, "uncertainty manual"),
     "hand": (SMALL, "position fk off"),
     "evaluation.ik": (SMALL, "off lbfgs arms"),
@@ -49,39 +43,25 @@ TRAINED: dict[str, tuple[list[str], str]] = {
 
 
 class Arm(NamedTuple):
-    """A trained arm and what it did."""
-
     model: MemMLP
     values: list[dict[str, float]]
     motion: torch.Tensor
     results: dict[str, Any]
 
 
-@pytest.fixture
-def home(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder whose outputs the tests of a process share; pieces to validate on are a second long."""
-    monkeypatch.setattr("memmlp.training.train_network.VALIDATION_PIECE", 60)
-    if "axes" not in FOLDERS:
-        FOLDERS["axes"] = tmp_path_factory.mktemp("axes")
-    monkeypatch.chdir(FOLDERS["axes"])
-    return FOLDERS["axes"]
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder whose outputs the tests share; pieces to validate on are a second long."""
+    folder = tmp_path_factory.mktemp("axes")
+    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
+        patch.setattr("memmlp.training.train_network.VALIDATION_PIECE", 60)
+        yield folder
 
 
-FOLDERS: dict[str, Path] = {}
-ARMS: dict[str, Arm] = {}
-
-
-def trained(overrides: list[str]) -> Arm:
-    """Two steps, a validation, and the first test clip evaluated as the config says; once for each config."""
-    cfg = compose_config(overrides)
-    key = OmegaConf.to_yaml(cfg)
-    if key not in ARMS:
-        ARMS[key] = train_and_stream(cfg)
-    return ARMS[key]
-
-
-def train_and_stream(cfg: DictConfig) -> Arm:
-    experiment = build_experiment(cfg)
+@functools.cache
+def trained(*overrides: str) -> Arm:
+    """Two steps, a validation, and the first test clip evaluated as the config says."""
+    experiment = build_experiment(compose_config(overrides))
     data = experiment.motion.prepare()
     above = make_prerequisites(experiment, data)
     run = Run(Path(mkdtemp(dir=".", prefix="arm-")))
@@ -110,25 +90,17 @@ def variants(axis: str) -> list[list[str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", TRAINED)
 def test_every_value_trains_streams_and_changes_something(axis, home):
-    base, *others = map(trained, variants(axis))
+    """Its weights' shapes, its loss, its motion or its branches."""
+    base, *others = (trained(*words) for words in variants(axis))
     for arm in (base, *others):
         assert arm.motion.shape == (12, 198)
         assert torch.isfinite(arm.motion).all()
         assert [torch.isfinite(torch.tensor([*values.values()])).all() for values in arm.values] == [True] * 2
     for value, arm in zip(variants(axis)[1:], others, strict=True):
-        assert differences(base, arm), value
-
-
-def differences(a: Arm, b: Arm) -> set[str]:
-    """In what two arms differ."""
-    branches = [{mode: set(of) for mode, of in arm.results.items()} for arm in (a, b)]
-    same = {
-        "weights": shapes(a.model) == shapes(b.model),
-        "loss": a.values[0] == b.values[0],
-        "motion": torch.allclose(a.motion, b.motion, atol=1e-6),
-        "results": branches[0] == branches[1],
-    }
-    return {name for name, equal in same.items() if not equal}
+        same = shapes(base.model) == shapes(arm.model) and base.values[0] == arm.values[0]
+        branches = [{mode: set(of) for mode, of in one.results.items()} for one in (base, arm)]
+        same = same and branches[0] == branches[1] and torch.allclose(base.motion, arm.motion, atol=1e-6)
+        assert not same, value
 
 
 def shapes(model: MemMLP) -> dict[str, torch.Size]:
@@ -156,7 +128,6 @@ def test_every_kind_of_graph_exports(overrides, tmp_path):
 
 
 def network(overrides: list[str]) -> MemMLP:
-    """The network of a command line, with random weights and codes."""
     torch.manual_seed(0)
     architecture = build_experiment(compose_config(overrides)).architecture
     codes = architecture.vqvae() if architecture.uses_codes else None

@@ -1,7 +1,5 @@
 """The data of a config: one folder, a list of them, named sources."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +17,9 @@ from memmlp.motion.preparing.find_clips import NamedFolders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
 MIX = {
-    "defaults": ["mocap", {"grouping@sources.bandai": "bandai_namco"}, "_self_"],
-    "name": "my_mix",
-    "root": None,
-    "sources": {"cmu": {"root": "a", "weight": 2}, "bandai": {"root": "b", "weight": 1}},
-}
+    "defaults": ["mocap", {"grouping@sources.bandai": "bandai_namco"}, "_self_"], "name": "my_mix",
+    "root": None, "sources": {"cmu": {"root": "a", "weight": 2}, "bandai": {"root": "b", "weight": 1}},
+}  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -43,13 +39,10 @@ def with_source(**keys) -> dict:
     return {"sources": {**MIX["sources"], "cmu": {**MIX["sources"]["cmu"], **keys}}}
 
 
-def test_a_list_of_one_folder_is_that_folder():
+def test_a_list_of_folders_names_sources_after_them():
     one, listed = (build_motion(compose_config(["data=mocap", f"data.root={root}"])) for root in ("a", "[a]"))
     assert one == listed
     assert isinstance(one.clips.split, SeededSplit)
-
-
-def test_a_list_of_folders_names_sources_after_them():
     source = build_motion(compose_config(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).clips
     assert source.root == NamedFolders({"b": Path("b"), "a": Path("a")})
     assert isinstance(source.split, MixedSplit)
@@ -92,22 +85,19 @@ def test_named_sources_have_groups_of_their_own():
     assert own.groups_digest != build_motion(mix()).groups_digest
 
 
-@pytest.mark.parametrize(
-    ("changes", "words", "said"),
-    [
-        ({"sources": {}}, [], "data.sources.bandai.root: has no value"),
-        ({"root": "a"}, [], "data.root=a"),
-        ({"sources": {**MIX["sources"], "c/d": {"root": "a"}}}, [], "data.sources.c/d"),
-        ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "data.sources: expected a weight"),
-        (with_source(root="nowhere"), [], "data.sources.cmu.root=nowhere"),
-        (with_source(weight=0), [], "data.sources.cmu.weight=0"),
-        (with_source(weigt=3), [], "data.sources.cmu.weigt: no such key; did you mean weight"),
-        (with_source(test=2), [], "data.sources.cmu.test=2"),
-        (with_source(groups_file="none.csv"), [], "data.sources.cmu.groups_file=none.csv"),
-        ({}, ["data.split.groups_file=conf/data/my_mix.yaml"], "data.sources.NAME.groups_file"),
-        ({}, ["data.sources.cmu.weight=-1"], "data.sources.cmu.weight=-1"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words", "said"), [
+    ({"sources": {}}, [], "data.sources.bandai.root: has no value"),
+    ({"root": "a"}, [], "data.root=a"),
+    ({"sources": {**MIX["sources"], "c/d": {"root": "a"}}}, [], "data.sources.c/d"),
+    ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "data.sources: expected a weight"),
+    (with_source(root="nowhere"), [], "data.sources.cmu.root=nowhere"),
+    (with_source(weight=0), [], "data.sources.cmu.weight=0"),
+    (with_source(weigt=3), [], "data.sources.cmu.weigt: no such key; did you mean weight"),
+    (with_source(test=2), [], "data.sources.cmu.test=2"),
+    (with_source(groups_file="none.csv"), [], "data.sources.cmu.groups_file=none.csv"),
+    ({}, ["data.split.groups_file=conf/data/my_mix.yaml"], "data.sources.NAME.groups_file"),
+    ({}, ["data.sources.cmu.weight=-1"], "data.sources.cmu.weight=-1"),
+])  # fmt: skip
 def test_what_does_not_go_together_is_one_line(changes, words, said):
     with pytest.raises(InputError, match="data") as error:
         mix(changes, *words)

@@ -1,7 +1,5 @@
 """Every shipped config composes, and every bad command line gives one line that names the key."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -23,16 +21,12 @@ def test_every_option_composes_and_passes(tmp_path: Path):
     needed = {
         "data=mocap": [root],
         "data=cmu_bandai": [f"data.sources.{source}.root={tmp_path}" for source in ("cmu", "bandai")],
-        "data=persons": [root],
-        "data=amass_s1": [root, lists],
-        "data=amass_s2": [root],
-        "data=amass_s3": [root],
-        "loss=avatar_poser": ["model=avatar_poser"],
-        "loss=of_network": ["model=bodiffusion"],
-        "prerequisite=sage": ["model=sage"],
+        "data=persons": [root], "data=amass_s1": [root, lists], "data=amass_s2": [root],
+        "data=amass_s3": [root], "loss=avatar_poser": ["model=avatar_poser"],
+        "loss=of_network": ["model=bodiffusion"], "prerequisite=sage": ["model=sage"],
         **{f"loss={name}": ["model=agrol_mlp"] for name in (*OF_TERMS, "agrol", "rpm", "terms")},
         **{f"predictor={name}": ["hand=fk"] for name in ("rotation_only", "rotation_only_memory")},
-    }
+    }  # fmt: skip
     options = [f"{slot}={name}" for slot in SLOTS for name in list_component_names(slot)]
     for group in ("data", "experiment", "loggers", "loss", "profile"):
         options += [f"{group}={path.stem}" for path in (find_packaged_folder("conf") / group).glob("*.yaml")]
@@ -42,30 +36,15 @@ def test_every_option_composes_and_passes(tmp_path: Path):
 
 
 def test_a_component_has_the_sizes_of_the_profile():
-    for profile, model, memory, optim in (
-        ("tiny", (11, 16), (8, [2, 4, 6, 8]), (20, 8)),
-        ("small", (41, 128), (48, [2, 4, 6, 8]), (2000, 32)),
-        ("paper", (41, 512), (192, [2, 4, 6, 8]), (300_000, 256)),
-    ):
+    for profile, *sizes in (
+        ("tiny", 11, 16, 8, 20, 8), ("small", 41, 128, 48, 2000, 32), ("paper", 41, 512, 192, 300_000, 256),
+    ):  # fmt: skip
         cfg = compose_config([f"profile={profile}"])
-        assert (cfg.model.frames, cfg.model.width) == model
-        assert (cfg.memory.width, list(cfg.memory.layers)) == memory
-        assert (cfg.optim.steps, cfg.optim.batch) == optim
+        found = [cfg.model.frames, cfg.model.width, cfg.memory.width, cfg.optim.steps, cfg.optim.batch]
+        assert (found, list(cfg.memory.layers)) == (sizes, [2, 4, 6, 8])
     cfg = compose_config(["profile=tiny", "profile.sizes=small", "profile.width=64", "model.depth=4"])
     assert (cfg.model.width, cfg.memory.width, list(cfg.memory.layers)) == (64, 24, [2, 4])
     assert cfg.optim.steps == 20
-
-
-def test_the_most_literal_reading():
-    cfg = compose_config(["experiment=paper"])
-    assert (cfg.model.width, cfg.model.depth, cfg.model.frames) == (512, 8, 41)
-    assert (cfg.normalizer.coordinates, cfg.normalizer.z_scores) == ("world", False)
-    assert (cfg.memory.shift, cfg.memory.history, cfg.memory.fusion) == ("frame", "latest", "plain")
-    assert cfg.rollout.name == "teacher_forcing"
-    assert (cfg.optim.steps, cfg.optim.batch, cfg.optim.drop_at) == (300_000, 256, 0.75)
-    assert (cfg.vqvae.epochs, cfg.vqvae.steps, cfg.vqvae.codebook) == (100, None, "ema")
-    assert (cfg.data.drawn_by, cfg.evaluation.ik) == ("clips", "lbfgs")
-    assert (compose_config([]).data.drawn_by, compose_config([]).evaluation.ik) == ("frames", "off")
 
 
 def test_a_vqvaes_epochs_are_of_the_training_frames():
@@ -79,17 +58,11 @@ def test_a_vqvaes_epochs_are_of_the_training_frames():
     assert [steps(frames).steps for frames in (1000, 5_000_000)] == [2000, 2000]
 
 
-def test_the_last_of_several_choices_wins():
-    assert compose_config(["memory=vq", "seed=1", "memory=none", "seed=2"]).seed == 2
-    assert compose_config(["memory=vq", "memory=none"]).memory.name == "none"
-
-
-def test_a_text_is_kept_as_it_was_written():
+def test_the_last_of_several_choices_wins_and_texts_are_kept(monkeypatch: pytest.MonkeyPatch):
+    cfg = compose_config(["memory=vq", "seed=1", "memory=none", "seed=2"])
+    assert (cfg.memory.name, cfg.seed) == ("none", 2)
     for word in ("'2024_11'", "2024", "2024_a", "007", "'[x]_1'", "True"):
         assert compose_config([f"save_predictions={word}"]).save_predictions == word.strip("'")
-
-
-def test_outputs_come_from_the_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MEMMLP_OUTPUTS", "/somewhere")
     assert compose_config([]).data.root == "/somewhere/data/synth"
 
@@ -99,8 +72,7 @@ BAD = {
         (["model.widht=3"], ["model.widht", "did you mean width?", "frames, width, depth"]),
         (["typo=1"], ["typo", "seed, device"]),
         (["data.split.tset=0.1"], ["data.split.tset", "did you mean test?"]),
-        (["memory=none", "memory.width=3"], ["memory.width"]),
-        (["loss.rotation=3"], ["loss.rotation", "lr"]),
+        (["memory=none", "memory.width=3"], ["memory.width"]), (["loss.rotation=3"], ["loss.rotation", "lr"]),
         (["hydra.runn.dir=."], ["hydra.runn", "did you mean run?"]),
         (["optim=schedule_free", "optim.schedule=step"], ["optim.schedule", "no such key"]),
         (["--cfg", "job", "model.widht=3"], ["model.widht", "did you mean width?"]),
@@ -124,8 +96,7 @@ BAD = {
     "out of range": [
         (["model.width=0"], ["model.width=0", "at least 1"]),
         (["device=tpu"], ["device=tpu", "auto or cpu or cuda"]),
-        (["optim.lr=nan"], ["optim.lr=nan", "above 0"]),
-        (["optim.lr=inf"], ["optim.lr=inf", "above 0"]),
+        (["optim.lr=nan"], ["optim.lr=nan", "above 0"]), (["optim.lr=inf"], ["optim.lr=inf", "above 0"]),
         (["optim.drop_at=1"], ["optim.drop_at=1", "below 1"]),
         (["optim.schedule=linear"], ["optim.schedule=linear", "step or cosine"]),
         (["memory.blend=1.5"], ["memory.blend=1.5", "at most 1 or sampled"]),
@@ -168,10 +139,8 @@ BAD = {
         (["~model.width"], ["model.width", "cannot be removed"]),
     ],
     "broken command lines": [
-        (["model.width"], ["model.width", "KEY=VALUE"]),
-        (["model.width=["], ["model.width=[", "KEY=VALUE"]),
-        (["=3"], ["=3"]),
-        (["model.width=1,2"], ["model.width=1,2", "-m"]),
+        (["model.width"], ["model.width", "KEY=VALUE"]), (["model.width=["], ["model.width=[", "KEY=VALUE"]),
+        (["=3"], ["=3"]), (["model.width=1,2"], ["model.width=1,2", "-m"]),
         (["--no-such-flag"], ["--no-such-flag"]),
         (["--config-dir", "nowhere"], ["nowhere", "existing folder"]),
         (["--config-name", "nowhere"], ["nowhere"]),
@@ -181,60 +150,55 @@ BAD = {
         (["model.width=16,x", "--multirun"], ["model.width=x", "an integer"]),
         (["-m", "memory=vq,mamba"], ["memory=mamba", "no_codes, none, vq"]),
     ],
-}
+}  # fmt: skip
 
 
-@pytest.fixture
-def _nothing_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(cfg: DictConfig) -> None:
-        pytest.fail("a job ran")
-
-    monkeypatch.setattr("memmlp.cli.train.run_training", fail)
-
-
-@pytest.mark.usefixtures("_nothing_runs")
 @pytest.mark.parametrize("kind", BAD)
-def test_a_bad_command_line_is_one_line(memmlp: Memmlp, tmp_path: Path, kind: str):
+def test_a_bad_command_line_is_one_line(memmlp: Memmlp, tmp_path: Path, monkeypatch, kind: str):
+    monkeypatch.setattr("memmlp.cli.train.run_training", lambda cfg: pytest.fail("a job ran"))
     for arguments, words in BAD[kind]:
         ran = memmlp("train", *arguments)
         assert one_line(ran, *words), (arguments, ran)
     assert list(tmp_path.iterdir()) == []
 
 
+HIDDEN = {
+    "--config-dir": ["train", "--config-dir", "mine", "optim.lr=-1"],
+    "--cfg": ["train", "--config-dir", "mine", "--cfg", "job"],
+    "hydra.searchpath": ["train", "hydra.searchpath=[file://mine]", "optim.lr=-1"],
+    "sweep": ["sweep", "s.yaml", "--config-dir", "mine", "optim.lr=-1"],
+}
+
+
 @pytest.mark.parametrize(
     ("place", "option"),
-    [
-        ("--config-dir", "experiment/paper.yaml"),
-        ("--cfg", "experiment/paper.yaml"),
-        ("hydra.searchpath", "experiment/paper.yaml"),
-        ("sweep", "experiment/paper.yaml"),
-        ("--config-dir", "train.yaml"),
-    ],
+    [*((place, "experiment/paper.yaml") for place in HIDDEN), ("--config-dir", "train.yaml")],
 )
-def test_an_option_of_ones_own_that_ours_hides_is_refused(
-    memmlp: Memmlp, tmp_path: Path, place: str, option: str
-):
+def test_an_option_of_ones_own_that_ours_hides_is_refused(memmlp, tmp_path: Path, place: str, option: str):
     """Hydra takes ours, and says nothing."""
     own = tmp_path / "mine" / option
     own.parent.mkdir(parents=True)
     own.write_text("# @package _global_\nmodel:\n  width: 16\n")
     (tmp_path / "s.yaml").write_text("variants: {a: [experiment=paper]}\n")
-    words = {
-        "--config-dir": ["train", "--config-dir", "mine", "optim.lr=-1"],
-        "--cfg": ["train", "--config-dir", "mine", "--cfg", "job"],
-        "hydra.searchpath": ["train", "hydra.searchpath=[file://mine]", "optim.lr=-1"],
-        "sweep": ["sweep", "s.yaml", "--config-dir", "mine", "optim.lr=-1"],
-    }[place]
-    assert one_line(memmlp(*words), f"mine/{option}", f"conf/{option} instead")
+    assert one_line(memmlp(*HIDDEN[place]), f"mine/{option}", f"conf/{option} instead")
     own.write_bytes((find_packaged_folder("conf") / option).read_bytes())  # the same is no other
-    ran = memmlp(*words)
+    ran = memmlp(*HIDDEN[place])
     assert ran.code == 0 if place == "--cfg" else one_line(ran, "optim.lr=-1")
 
 
-def test_a_file_with_the_name_of_a_component_is_refused(memmlp: Memmlp, tmp_path: Path):
-    (tmp_path / "mine" / "memory").mkdir(parents=True)
-    (tmp_path / "mine" / "memory" / "gru.yaml").write_text("name: gru\n")
-    assert one_line(memmlp("train", "--config-dir", "mine"), "mine/memory/gru.yaml", "rename the file")
+@pytest.mark.parametrize(("file", "text", "choice", "words"), [
+    ("memory/gru.yaml", "name: gru", [], ("mine/memory/gru.yaml", "rename the file")),
+    (
+        "experiment/own.yaml", "# @package _global_\ndefaults: [{/experiment: no_codes}]",
+        ["experiment=own"], ("experiment=own", "includes itself", "'- NAME'"),
+    ),
+])  # fmt: skip
+def test_a_file_that_hides_a_component_or_leads_back_to_itself_is_refused(
+    memmlp: Memmlp, tmp_path: Path, file: str, text: str, choice: list[str], words: tuple[str, ...]
+):
+    (tmp_path / "mine" / file).parent.mkdir(parents=True)
+    (tmp_path / "mine" / file).write_text(f"{text}\n")
+    assert one_line(memmlp("train", "--config-dir", "mine", *choice), *words)
 
 
 def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
@@ -245,26 +209,15 @@ def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
     assert (both.memory.name, both.loss.name) == ("no_codes", "manual")
 
 
-def test_an_experiment_that_leads_back_to_itself_is_refused(memmlp: Memmlp, tmp_path: Path):
-    (tmp_path / "mine" / "experiment").mkdir(parents=True)
-    own = tmp_path / "mine" / "experiment" / "own.yaml"
-    own.write_text("# @package _global_\ndefaults: [{/experiment: no_codes}]\n")
-    ran = memmlp("train", "--config-dir", "mine", "experiment=own")
-    assert one_line(ran, "experiment=own", "includes itself", "'- NAME'")
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["model.width=8", "seed=3"],
-        ["model=bodiffusion", "refiner=sage", "profile=paper"],
-        ["model=recurrent_poser", "loss=calm", "optim=adamw", "loggers=all"],
-        ["hand='off'", "predictor=rotation_only", "memory=none", "loss=manual"],
-        ["profile=tiny", "memory=gru", "experiment=no_memory", "optim.steps=4"],
-        ["model=avatar_poser", "loss.position=2", "~loggers"],
-        ["profile.width=16", "data.split.groups=[a,b]", "paths.outputs=elsewhere", "loggers=none"],
-    ],
-)
+@pytest.mark.parametrize("overrides", [
+    ["model.width=8", "seed=3"],
+    ["model=bodiffusion", "refiner=sage", "profile=paper"],
+    ["model=recurrent_poser", "loss=calm", "optim=adamw", "loggers=all"],
+    ["hand='off'", "predictor=rotation_only", "memory=none", "loss=manual"],
+    ["profile=tiny", "memory=gru", "experiment=no_memory", "optim.steps=4"],
+    ["model=avatar_poser", "loss.position=2", "~loggers"],
+    ["profile.width=16", "data.split.groups=[a,b]", "paths.outputs=elsewhere", "loggers=none"],
+])  # fmt: skip
 def test_a_job_is_composed_as_hydra_composes_it(overrides):
     """Options of groups are chosen once for many jobs (twice here), and changes of one job are its own."""
     args = parse_hydra_arguments(overrides)

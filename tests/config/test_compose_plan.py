@@ -1,7 +1,5 @@
 """What a kept plan depends on. (What it is used for is in tests/cli/test_sweep.)"""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,9 +54,7 @@ SWEEPS: list[tuple[str, list[str], str | None]] = [
 
 
 @pytest.mark.parametrize(("content", "words", "said"), SWEEPS)
-def test_nothing_undoes_the_experiment_of_an_variant(
-    tmp_path: Path, content: str, words: list[str], said: str | None
-):
+def test_nothing_undoes_the_experiment_of_an_variant(tmp_path, content, words, said):
     """Hydra lets a group on the command line win over an experiment's, and the label would be wrong."""
     path = tmp_path / "s.yaml"
     path.write_text(content)

@@ -1,7 +1,5 @@
 """Names say what differs from the default, whatever Hydra is busy with."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

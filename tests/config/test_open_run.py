@@ -1,7 +1,5 @@
 """Finished runs opened again: which keys may then have other values."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,6 @@ from memmlp.runs.run import Run
 
 @pytest.fixture
 def trained(tmp_path: Path) -> Run:
-    """A run that has a record alone."""
     run = Run.from_id(tmp_path, "0123456789abcdef")
     run.folder.mkdir(parents=True)
     config = build_experiment(

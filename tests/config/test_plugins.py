@@ -1,7 +1,5 @@
 """Packages of one's own: which are used, what they add, and that nothing is imported that nobody named."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Iterator
@@ -37,7 +35,6 @@ OWN = [f"plugins=[{PACKAGE}]", "experiment=feet", "profile=tiny"]
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder on the path for modules of one's own."""
     monkeypatch.syspath_prepend(tmp_path)
     with registers_kept():
         yield tmp_path
@@ -55,7 +52,7 @@ def test_a_package_is_used_where_somebody_names_it(on_path: Path, how: str, monk
     if how == "environment":
         monkeypatch.setenv("MEMMLP_PLUGINS", f" {PACKAGE},")
     if how == "entry point":
-        entries = (EntryPoint("feet", PACKAGE, plugins.GROUP),)
+        entries = [EntryPoint("feet", PACKAGE, plugins.GROUP)]
         monkeypatch.setattr(plugins.metadata, "entry_points", lambda group: entries if group else ())
         plugins.list_installed.cache_clear()
     try:
@@ -84,32 +81,26 @@ def test_keys_of_a_custom_component_are_checked(on_path: Path):
 
 
 def raise_version(monkeypatch: pytest.MonkeyPatch, slot: str, name: str) -> None:
-    monkeypatch.setitem(
-        components.collect_components(),
-        (slot, name),
-        replace(components.find_component(slot, name), version=2),
-    )
+    newer = replace(components.find_component(slot, name), version=2)
+    monkeypatch.setitem(components.collect_components(), (slot, name), newer)
 
 
 def test_an_experiment_knows_packages_and_versions(on_path: Path, monkeypatch: pytest.MonkeyPatch):
     experiment = build_experiment(compose_config(OWN))
     assert experiment.config["plugins"] == [PACKAGE]
-    versions = experiment.identity("d").component_versions
+    versions, before = experiment.identity("d").component_versions, experiment.identity("d").id
     assert (versions["memory.mean"], versions["term.skate"]) == (1, 1)
-    before = experiment.identity("d").id
     raise_version(monkeypatch, "memory", "mean")
     assert experiment.identity("d").id != before
-    plain, named = (build_experiment(compose_config(words)) for words in ([], [f"plugins=[{PACKAGE}]"]))
-    assert plain.config["plugins"] == []
-    assert named.identity("d").id == plain.identity("d").id
+    plain, named = (build_experiment(compose_config(words)) for words in ([], OWN[:1]))
+    assert (plain.config["plugins"], named.identity("d").id) == ([], plain.identity("d").id)
 
 
 def test_custom_metrics_make_another_evaluation(on_path: Path, monkeypatch: pytest.MonkeyPatch):
     config = build_experiment(compose_config(OWN)).config
     without = {**config, "evaluation": {**config["evaluation"], "metrics": []}}
-    assert select_evaluation_settings(config, "stream")["metrics"] == {
-        "FootSkate": f"{PACKAGE}.metrics.foot_skate"
-    }
+    named = {"FootSkate": f"{PACKAGE}.metrics.foot_skate"}
+    assert select_evaluation_settings(config, "stream")["metrics"] == named
     assert "metrics" not in select_evaluation_settings(without, "stream")
     before = compute_evaluation_id(config, "stream")
     assert before != compute_evaluation_id(without, "stream")
@@ -125,13 +116,14 @@ def test_a_loss_has_the_term_with_its_weight(on_path: Path):
         assert [one.weighting.weights()["skate"] for one in losses] == weights
         assert sum(len(group["params"]) for group in losses[0].weighting.parameter_groups()) == groups
         assert len({one.identity("d").id for one in experiments}) == 2
-    whole = compose_config([*OWN, "predictor=rotation_only", "hand=off", "loss=agrol", "evaluation.ik=off"])
-    with pytest.raises(InputError, match=r"term=skate: .*loss=agrol"):
-        build_experiment(whole)
-    with pytest.raises(InputError, match=r"term=skate: .*predictor=rot"):
-        build_experiment(compose_config([*OWN, "predictor=rotation_only", "hand=off"]))
-    with pytest.raises(InputError, match=r"term: .*model=agrol_mlp"):
-        compose_config([f"plugins=[{PACKAGE}]", "model=agrol_mlp", "term=skate"])
+    rotations = [*OWN, "predictor=rotation_only", "hand=off"]
+    for words, line in (
+        ([*rotations, "loss=agrol", "evaluation.ik=off"], r"term=skate: .*loss=agrol"),
+        (rotations, r"term=skate: .*predictor=rot"),
+        ([*OWN[:1], "model=agrol_mlp", "term=skate"], r"term: .*model=agrol_mlp"),
+    ):
+        with pytest.raises(InputError, match=line):
+            build_experiment(compose_config(words))
 
 
 def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
@@ -176,23 +168,22 @@ from memmlp.common.settings import MetricSettings, Settings, setting
 """
 
 
-def test_wrong_declarations_are_one_line(folder: Path):
-    metric = '@component("metric", "A")\nclass ASettings'
-    for number, (text, line) in enumerate((
-        ('@component("memory", "gru")\nclass Mine: pass\n', "memory=gru exists already"),
-        ('@component("metric", "MPJPE")\nclass S(MetricSettings): smallest = 1\n', "metric MPJPE: "),
-        (f"{metric}(MetricSettings): smallest = 0\n", "metric A: "),
-        (f'{metric}(MetricSettings): smallest, better = 1, "more"\n', "metric A: `better`"),
-        (f"{metric}(torch.nn.Module): pass\n", "name 'torch' is not defined"),
-    )):  # fmt: skip
-        name = f"mine{number}"
-        write(folder, {f"{name}.py": HEAD + text})
-        with pytest.raises(InputError) as error:
-            compose_config([f"plugins=[{name}]"])
-        assert line in str(error.value)
-        assert str(error.value).startswith(f"plugin {name}: ")
-        assert name not in plugins.list_active()
-        assert compose_config(["memory=gru"]).memory.name == "gru"
+METRIC = '@component("metric", "A")\nclass ASettings'
+
+
+@pytest.mark.parametrize(("text", "line"), [
+    ('@component("memory", "gru")\nclass Mine: pass\n', "memory=gru exists already"),
+    ('@component("metric", "MPJPE")\nclass S(MetricSettings): smallest = 1\n', "metric MPJPE: "),
+    (f"{METRIC}(MetricSettings): smallest = 0\n", "metric A: "),
+    (f'{METRIC}(MetricSettings): smallest, better = 1, "more"\n', "metric A: `better`"),
+    (f"{METRIC}(torch.nn.Module): pass\n", "name 'torch' is not defined"),
+])  # fmt: skip
+def test_wrong_declarations_are_one_line(folder: Path, text: str, line: str):
+    write(folder, {"mine.py": HEAD + text})
+    with pytest.raises(InputError, match=f"^plugin mine: .*{line}"):
+        compose_config(["plugins=[mine]"])
+    assert "mine" not in plugins.list_active()
+    assert compose_config(["memory=gru"]).memory.name == "gru"
 
 
 def test_packages_that_cannot_be_used_are_named(folder: Path):
@@ -209,65 +200,35 @@ def test_packages_that_cannot_be_used_are_named(folder: Path):
             compose_config(words)
 
 
-def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
-    write(folder, {"conf/experiment/own.yaml": "# @package _global_\nseed: 7"})
-    with plugins.search_folder(folder / "conf"):
-        assert compose_config(["experiment=own"]).seed == 7
-        assert plugins.format_config_dir() == ["--config-dir", str(folder / "conf")]
-    with pytest.raises(InputError, match=r"experiment=own: no such option"):
-        compose_config(["experiment=own"])
-
-
-COORDINATES = """
-import torch
-from memmlp.common.components import component
-from memmlp.motion.network_coordinates import World
-
-@component("coordinates", "floor")
-class Floor(World): pass
-"""
-
-
-def test_custom_coordinates(folder: Path):
-    write(folder, {"mine.py": COORDINATES})
-    experiment = build_experiment(compose_config(["plugins=[mine]", "normalizer.coordinates=floor"]))
-    assert type(experiment.architecture.coordinates).__name__ == "Floor"
-    assert experiment.config["plugins"] == ["mine"]
-    assert experiment.identity("d").id != build_experiment(compose_config([])).identity("d").id
-
-
 WALKS = """
 from dataclasses import dataclass
 from memmlp.common.components import component
 from memmlp.common.settings import Settings, setting
-
+from memmlp.motion.network_coordinates import World
+@component("coordinates", "floor")
+class Floor(World): pass
 @component("generator", "walks", version=VERSION, builds="walks")
 @dataclass
 class WalksSettings(Settings):
     minutes: float = setting(None, 1)
     seed: int = setting(None, 0)
-
 def walks(folder, minutes, seed):
     (folder / f"{minutes} {seed}").touch()
 """
-WALKS_YAML = """
-defaults: [synth, override /generator@synth: walks, _self_]
-name: walks
-root: made
-"""
 
 
-def test_a_custom_data_source(folder: Path):
+def test_a_custom_data_source_and_custom_coordinates(folder: Path):
+    yaml = "defaults: [synth, override /generator@synth: walks, _self_]\nname: walks\nroot: made\n"
     files = {"mine/__init__.py": "", "mine/walks.py": WALKS.replace("VERSION", "1")}
-    write(folder, {**files, "mine/conf/data/walks.yaml": WALKS_YAML})
-    cfg = compose_config(["plugins=[mine]", "data=walks", "data.synth.minutes=2", "data.synth.seed=3"])
-    source = build_motion(cfg)
+    write(folder, {**files, "mine/conf/data/walks.yaml": yaml})
+    words = ["data=walks", "data.synth.minutes=2", "data.synth.seed=3", "normalizer.coordinates=floor"]
+    cfg = compose_config(["plugins=[mine]", *words])
+    source, experiment = build_motion(cfg), build_experiment(cfg)
     assert source.clips.root == Path("made/walks-minutes2.0-seed3")
     source.generate(folder)
     assert (folder / "2.0 3").exists()
-    config = build_experiment(cfg).config
-    assert config["plugins"] == ["mine"]
-    assert restore_config(config).data == cfg.data
+    assert type(experiment.architecture.coordinates).__name__ == "Floor"
+    assert (experiment.config["plugins"], restore_config(experiment.config).data) == (["mine"], cfg.data)
 
 
 def test_an_executor_of_ones_own(folder: Path):
@@ -330,14 +291,11 @@ def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
     assert run.changed_sources == []  # nobody knows
 
 
-def test_names_choose_a_grouping():
+def test_names_choose_a_grouping(tmp_path: Path):
+    """One that is suggested replaces the default."""
     assert choose_grouping(["ann/walk", "dataset-1_walk_active_001"]) == "bandai_namco"
     assert choose_grouping(["ann/walk"]) is None
     assert choose_grouping(["salsa/01", "salsa/16"]) is None  # of the default
-
-
-def test_the_default_is_that_of_own_motion(tmp_path: Path):
-    """A grouping that is suggested replaces it."""
 
     def groups(*overrides: str) -> list[str]:
         return list(compose_config(["data=mocap", f"data.root={tmp_path}", *overrides]).data.split.groups)

@@ -1,7 +1,5 @@
 """Sizes of networks that were not trained, in the place of runs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

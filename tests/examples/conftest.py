@@ -1,7 +1,5 @@
 """A clip of trackers through a tiny network in a space, as the examples of docs/examples read it."""
 
-from __future__ import annotations
-
 import runpy
 from collections.abc import Callable
 from pathlib import Path

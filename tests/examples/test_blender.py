@@ -1,7 +1,5 @@
 """The example for Blender: an armature that moves as the prediction does, in the files that it saves."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
@@ -60,14 +58,7 @@ def ran(script: Path, *words: str | Path) -> subprocess.CompletedProcess[str]:
 def test_bones_stand_at_the_joints_of_the_stream(played: Callable[[str], Played], tmp_path: Path):
     blender()
     clip, motion = played("amass"), tmp_path / "motion.npz"
-    script = [
-        sys.executable,
-        EXAMPLES / "python/full_body.py",
-        clip.network,
-        clip.trackers,
-        "--save",
-        motion,
-    ]
+    script = [sys.executable, EXAMPLES / "python/full_body.py", clip.network, clip.trackers, "--save", motion]
     subprocess.run(script, check=True, timeout=300)
     animate, read = EXAMPLES / "blender/animate.py", tmp_path / "read.py"
     read.write_text(READ.replace("COUNT", str(len(clip.joints))).replace("NAMES", str(JOINTS)))

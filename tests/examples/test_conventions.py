@@ -1,7 +1,5 @@
 """The axes of engines in the pictures and in the guide's table."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from types import ModuleType

@@ -1,7 +1,5 @@
 """The examples that print joints in three languages agree with `memmlp.Stream`."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The script that writes a clip's head and hands as CSV."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 

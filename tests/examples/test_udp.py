@@ -1,7 +1,5 @@
 """The example that sends head and wrists, as `memmlp live` reads them."""
 
-from __future__ import annotations
-
 import runpy
 import socket
 import subprocess

@@ -4,8 +4,6 @@ The scripts compile in C# 7, and states, axes, frames, lost trackers, calibratio
 far as the stand-ins (tests/examples/unity) are. Unity itself is not tested.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -13,7 +11,6 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-import onnxruntime
 import pytest
 import wearer
 from examples.conftest import EXAMPLES, PERSON, Played, trackers
@@ -37,7 +34,6 @@ Rows = list[tuple[float, np.ndarray, str]]  # a time, trackers (3, 7) with NaN w
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The example, compiled."""
     if shutil.which("mcs") is None or shutil.which("mono") is None:
         pytest.skip("Mono is not installed (apt-get install mono-mcs mono-runtime)")
     path = tmp_path_factory.mktemp("unity") / "play.exe"
@@ -65,7 +61,8 @@ class Player:
         names = ("model.txt", "avatar.csv", "samples.csv", "bones.csv")
         model, avatar, samples, out = files = [self.folder / name for name in names]
         parts = (self.session.get_inputs(), self.session.get_outputs())
-        ends = "\n\n".join("\n".join(described(one) for one in part) for part in parts)
+        described = ["\n".join(" ".join(map(str, (one.name, *one.shape))) for one in part) for part in parts]
+        ends = "\n\n".join(described)
         model.write_text(ends.replace("rotations 1 22 3 3", "rotations 1 22 4") if self.quaternions else ends)
         np.savetxt(avatar, REST, delimiter=",")
         samples.write_text("\n".join(",".join(written(*row)) for row in rows))
@@ -98,10 +95,6 @@ class Player:
 @pytest.fixture
 def play(program: Path, played: Callable[[str], Played], tmp_path: Path) -> Player:
     return Player(program, played("unity").network, tmp_path)
-
-
-def described(end: onnxruntime.NodeArg) -> str:
-    return " ".join(map(str, (end.name, *end.shape)))
 
 
 def written(time: float, frame: np.ndarray, word: str) -> list[str]:

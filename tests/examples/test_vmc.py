@@ -1,7 +1,5 @@
 """The example that prints bones reads the VMC packets of python-osc."""
 
-from __future__ import annotations
-
 import re
 import socket
 import subprocess
@@ -47,17 +45,11 @@ def test_it_prints_where_bones_are():
     random = np.random.default_rng(0)
     frames = random.normal(size=(FRAMES + 1, len(PARENTS), 7))
     frames[..., 3:] /= np.linalg.norm(frames[..., 3:], axis=-1, keepdims=True)
-    command = [
-        sys.executable,
-        str(EXAMPLES / "vmc/receive.py"),
-        "--port",
-        "0",
-        "--frames",
-        str(FRAMES),
-        "--all",
-    ]
+    receive = [str(EXAMPLES / "vmc/receive.py"), "--port", "0", "--frames", str(FRAMES), "--all"]
     with (
-        started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+        started(
+            [sys.executable, *receive], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
         port = int(re.search(r"\d+", process.stderr.readline())[0])

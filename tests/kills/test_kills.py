@@ -1,7 +1,5 @@
 """Processes killed at arbitrary moments: a training, a sweep and a search end as undisturbed ones do."""
 
-from __future__ import annotations
-
 import json
 import random
 import shutil
@@ -25,7 +23,6 @@ QUICK = ["export.graph=off", "evaluation.modes=[stream]"]
 
 
 def last_step(outputs: Path) -> int:
-    """The step of the network's newest checkpoint."""
     runs = [run for run in list_runs(outputs) if run.manifest.get("kind") == "memmlp"]
     files = [run.checkpoint for run in runs if run.checkpoint.exists()]
     return max((int(checkpoint.read(file)[1]["step"]) for file in files), default=0)
@@ -106,15 +103,11 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
     again = {"started": "2999-01-01T00:00:00+00:00", "stage": "training"}
     Run.from_id(stormy, "0" * 16).write_manifest({"attempts": [again]})
     assert sorted(chaos.compare(calm, stormy)) == [
-        f"run {'0' * 16}: trained again after it was finished",
-        f"run {'a' * 16} is missing",
-        f"run {'b' * 16}: other weights",
-        f"run {'c' * 16}: stopped, not done",
-        f"run {'d' * 16}: is still held",
-        f"run {'e' * 16}: artifact model.safetensors is missing or changed",
-        f"run {'e' * 16}: other weights",
-        f"run {'f' * 16} should not be",
-    ]
+        f"run {'0' * 16}: trained again after it was finished", f"run {'a' * 16} is missing",
+        f"run {'b' * 16}: other weights", f"run {'c' * 16}: stopped, not done",
+        f"run {'d' * 16}: is still held", f"run {'e' * 16}: artifact model.safetensors is missing or changed",
+        f"run {'e' * 16}: other weights", f"run {'f' * 16} should not be",
+    ]  # fmt: skip
 
 
 @pytest.mark.slow

@@ -1,13 +1,11 @@
 """Full or read-only disks, and files cut anywhere: nothing is lost, and one line names the fault."""
 
-from __future__ import annotations
-
 import builtins
 import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from begun_runs import complete
@@ -83,7 +81,7 @@ class Written:
             return half
         return self.file.write(content)
 
-    def __enter__(self) -> Written:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -118,7 +116,6 @@ def finish(plan: Plan, task: RunTask) -> None:
 
 
 def sound(run: Run) -> bool:
-    """Whether all files of a run are whole, so that it can be resumed."""
     assert [entry.values for entry in run.metrics()] == [{"loss": 1 / (n + 1)} for n in range(run.step)]
     assert not run.done or run.verify() == []
     assert all(map(is_intact, run.evaluations.glob("*.json")))
@@ -135,7 +132,6 @@ def error_of(action: Callable[[], object]) -> Exception | None:
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Records are small."""
     monkeypatch.setattr("memmlp.runs.environment.read_code_files", lambda packages: {"a.py": b"0"})
     monkeypatch.setattr("memmlp.runs.run.create_code_patch", lambda: "")
     for module in ("run", "evaluation_file", "deployment_folder"):

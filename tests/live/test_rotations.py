@@ -1,7 +1,5 @@
 """The NumPy functions compute what the torch functions do."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp

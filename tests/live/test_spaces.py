@@ -1,7 +1,5 @@
 """Frames of reference: what they mean, and the way there and back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

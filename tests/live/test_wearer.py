@@ -1,7 +1,5 @@
 """Wearers of other heights and on other floors, and their calibrations as files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -11,20 +9,12 @@ import pytest
 import wearer as moving
 
 from memmlp.common.errors import InputError
+from memmlp.live import wearer
 from memmlp.live.rotations import BodyTree, matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.tracker_input import SampleWarning
 from memmlp.live.tracker_resampling import make_t_pose
-from memmlp.live.wearer import (
-    Calibration,
-    Offsets,
-    check_offsets,
-    compute_body_height,
-    make_wearer,
-    read_calibration,
-    save_calibration,
-)
 from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 
 REST = make_builtin_rest_joints()
@@ -40,20 +30,18 @@ def file(step_files: Callable[[str], Path]) -> Path:
 
 
 def test_the_floor_comes_to_zero():
-    assert compute_body_height(BODY) == pytest.approx(1.72)
-    assert make_wearer(BODY).scale == 1
-    tall = make_wearer(BODY, 2.0, 0.3)
+    assert wearer.compute_body_height(BODY) == pytest.approx(1.72)
+    assert wearer.make_wearer(BODY).scale == 1
+    tall = wearer.make_wearer(BODY, 2.0, 0.3)
     standing = np.array([[0.5, -0.25, 0.3], [0.0, 0.0, 2.3]])  # on the floor, and the top of the head
     np.testing.assert_allclose(tall.scale_to_network(standing)[:, 2], [0, 1.72], atol=1e-12)
-
-
-def test_impossible_heights_and_floors_are_refused():
-    for height in (0.1, 180, float("nan"), "tall"):
-        with pytest.raises(InputError, match="height="):
-            make_wearer(BODY, height)
-    for floor in (1e3, float("inf"), None):
-        with pytest.raises(InputError, match="floor="):
-            make_wearer(BODY, None, floor)
+    for key, values in {
+        "height": (0.1, 180, float("nan"), "tall"),
+        "floor": (1e3, float("inf"), None),
+    }.items():
+        for value in values:
+            with pytest.raises(InputError, match=f"{key}="):
+                wearer.make_wearer(BODY, **{key: value})
 
 
 @pytest.mark.slow
@@ -82,7 +70,7 @@ def test_a_tall_wearer_on_a_raised_floor_moves_as_the_network_s_body(name: str, 
 @pytest.mark.slow
 def test_another_height_restarts_the_stream_and_forgets_offsets_with_a_warning(file: Path):
     """Kept, the offsets would hold the hands some centimetres away."""
-    offsets = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
+    offsets = wearer.Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
     stream = Stream(file, height=HEIGHT, offsets=offsets)
     moving.play(stream, PERSON.positions, PERSON.rotations)
     stream.fit(HEIGHT, FLOOR)
@@ -116,27 +104,25 @@ def test_calibration_is_in_metres_of_the_wearer(file: Path):
     assert np.linalg.norm(head - (joints[0] + away.mean(0))) < 1e-6
 
 
-# Files
-
 TURNS = np.stack([np.eye(3), np.eye(3)[[1, 2, 0]], np.diag([1.0, -1, -1])])
 WORDS = {
     "memmlp": "calibration", "space": "unity", "height": 1.8, "floor": 0,
     "joints": (REST[BODY.tracked] - [0, REST[:, 1].min(), REST[BODY.tracked, 2].mean()]).tolist(),
 }  # fmt: skip
-WORN = Calibration("unity", Offsets(np.arange(9.0).reshape(3, 3) / 7, TURNS), 1.815, -0.02)
+WORN = wearer.Calibration("unity", wearer.Offsets(np.arange(9.0).reshape(3, 3) / 7, TURNS), 1.815, -0.02)
 
 
 def test_there_and_back(tmp_path: Path):
-    for made in (WORN, Calibration("openxr")):
-        save_calibration(tmp_path / "me.json", made, BODY)
-        again = read_calibration(tmp_path / "me.json", made.space, BODY)
+    for made in (WORN, wearer.Calibration("openxr")):
+        wearer.save_calibration(tmp_path / "me.json", made, BODY)
+        again = wearer.read_calibration(tmp_path / "me.json", made.space, BODY)
         assert (again.space, again.height, again.floor) == (made.space, made.height, made.floor)
         assert (again.offsets is None) == (made.offsets is None)
         if again.offsets and made.offsets:
             for part, before in zip(again.offsets, made.offsets, strict=True):
                 np.testing.assert_array_equal(part, before)
     with pytest.raises(InputError, match="cannot be written"):
-        save_calibration(tmp_path / "none" / "me.json", WORN, BODY)
+        wearer.save_calibration(tmp_path / "none" / "me.json", WORN, BODY)
 
 
 def wider(by: float) -> np.ndarray:
@@ -148,7 +134,7 @@ def wider(by: float) -> np.ndarray:
 
 def test_offsets_of_another_space_or_body_are_refused(tmp_path: Path):
     """They would hold the hands elsewhere, silently."""
-    save_calibration(tmp_path / "me.json", WORN, BODY)
+    wearer.save_calibration(tmp_path / "me.json", WORN, BODY)
     for space, rest, said in (
         ("openxr", REST, r"unity.*openxr"),
         ("unity", REST * 1.68 / 1.72, r"head or wrists are 3\.\d cm away"),
@@ -156,28 +142,28 @@ def test_offsets_of_another_space_or_body_are_refused(tmp_path: Path):
         ("unity", wider(-0.03), r"head or wrists are 2\.0 cm away"),
     ):
         with pytest.raises(InputError, match=rf"me\.json: .*{said}"):
-            read_calibration(tmp_path / "me.json", space, BodyTree(JOINTS, PARENTS, rest))
+            wearer.read_calibration(tmp_path / "me.json", space, BodyTree(JOINTS, PARENTS, rest))
     near = BodyTree(JOINTS, PARENTS, wider(0.003))  # rounding
-    assert read_calibration(tmp_path / "me.json", "unity", near).height == 1.815
+    assert wearer.read_calibration(tmp_path / "me.json", "unity", near).height == 1.815
 
 
-def test_damaged_calibrations_are_refused(tmp_path: Path):
-    for content in (
-        "", "[]", "{}", "[" * 5000, '{"memmlp": "calibration", "space": "unity"}', '{"memmlp": "calibr',
-        json.dumps(WORDS), json.dumps(WORDS | {"offsets": {}}), json.dumps(WORDS | {"offsets": 5}),
-        json.dumps(WORDS | {"offsets": None, "joints": [1, 2]}),
-        json.dumps(WORDS | {"offsets": None, "joints": [[float("nan")] * 3] * 3}),
-        json.dumps(WORDS | {"offsets": {"positions": [[0] * 3] * 3, "rotations": [[[1] * 3] * 3] * 3}}),
-    ):  # fmt: skip
-        (tmp_path / "me.json").write_text(content)
-        with pytest.raises(InputError, match=r"me\.json"):
-            read_calibration(tmp_path / "me.json", "unity", BODY)
+@pytest.mark.parametrize("content", [
+    "", "[]", "{}", "[" * 5000, '{"memmlp": "calibration", "space": "unity"}', '{"memmlp": "calibr',
+    json.dumps(WORDS), json.dumps(WORDS | {"offsets": {}}), json.dumps(WORDS | {"offsets": 5}),
+    json.dumps(WORDS | {"offsets": None, "joints": [1, 2]}),
+    json.dumps(WORDS | {"offsets": None, "joints": [[float("nan")] * 3] * 3}),
+    json.dumps(WORDS | {"offsets": {"positions": [[0] * 3] * 3, "rotations": [[[1] * 3] * 3] * 3}}),
+])  # fmt: skip
+def test_damaged_calibrations_are_refused(tmp_path: Path, content: str):
+    (tmp_path / "me.json").write_text(content)
+    with pytest.raises(InputError, match=r"me\.json"):
+        wearer.read_calibration(tmp_path / "me.json", "unity", BODY)
 
 
 def test_bad_offsets_are_rejected():
     for offsets in (
-        5, (1, 2, 3), Offsets(np.zeros(3), np.eye(3)), Offsets(np.full((3, 3), np.nan), TURNS),
-        Offsets(np.zeros((3, 3)), 2 * TURNS), Offsets(np.zeros((3, 3)), -TURNS),
+        5, (1, 2, 3), wearer.Offsets(np.zeros(3), np.eye(3)), wearer.Offsets(np.full((3, 3), np.nan), TURNS),
+        wearer.Offsets(np.zeros((3, 3)), 2 * TURNS), wearer.Offsets(np.zeros((3, 3)), -TURNS),
     ):  # fmt: skip
         with pytest.raises(InputError, match="offsets"):
-            check_offsets(offsets)
+            wearer.check_offsets(offsets)

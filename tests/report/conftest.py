@@ -1,7 +1,5 @@
 """A sweep with finished runs that are kept, for the tests of kept results and of their pages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

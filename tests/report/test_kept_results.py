@@ -1,13 +1,12 @@
 """Results kept with the code: what is written, read again, merged and refused."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_table import cell as find_cell
 
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import (
@@ -45,17 +44,11 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: KeptResults, tmp_p
 def test_a_run_that_diverged_is_kept(sweep: Sweep, kept: KeptResults, tmp_path: Path, number: float):
     """It is no run less: its variant has no mean, and no other variant's looks better for it."""
     run = kept.runs["2"][1]
-    for clip in run.clips:
-        run.clips[clip]["stream"]["combined"]["MPJPE"] = number
-    run.means["stream"]["combined"]["MPJPE"] = number
+    for errors in (run.means, *run.clips.values()):
+        errors["stream"]["combined"]["MPJPE"] = number
     save_results(tmp_path / "kept.json", kept)
-    cells = [
-        next(row for row in make_table(sweep, one.select_runs(sweep)).rows if row.label == "2").cells[
-            "stream"
-        ]["MPJPE"]
-        for one in (kept, load_kept_results(tmp_path / "kept.json"))
-    ]
-    for cell in cells:
+    for one in (kept, load_kept_results(tmp_path / "kept.json")):
+        cell = find_cell(make_table(sweep, one.select_runs(sweep)), "2", "MPJPE")
         assert sorted(cell.values) == [0, 1, 2]
         assert not np.isfinite(cell.mean)
 
@@ -74,22 +67,18 @@ def test_kept_results_have_the_same_bytes(kept: KeptResults, tmp_path: Path):
     assert format_results(replace(kept, runs=turned)) == format_results(kept)
     save_results(tmp_path / "kept.json", kept)
     assert format_results(load_kept_results(tmp_path / "kept.json")) == format_results(kept)
-    assert (
-        max(map(len, format_results(kept).splitlines())) < 1000
-    )  # a line a list, so that changes can be read
+    assert max(map(len, format_results(kept).splitlines())) < 1000  # changes can be read
 
 
 def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: KeptResults, tmp_path: Path):
     """Variants may show what two graphs of one training cost, and one of them two evaluations, too."""
     one, two, three = list(kept.runs)[:3]
-    slower = {
-        seed: replace(run, costs={**run.costs, "ms": 5.0}, clip_sources={})
-        for seed, run in kept.runs[one].items()
+    runs = {
+        label: {s: replace(run, clip_sources={}) for s, run in kept.runs[label].items()}
+        for label in (one, three)
     }
-    solved = {
-        seed: replace(run, id=kept.runs[one][seed].id, clip_sources={})
-        for seed, run in kept.runs[three].items()
-    }
+    slower = {seed: replace(run, costs={**run.costs, "ms": 5.0}) for seed, run in runs[one].items()}
+    solved = {seed: replace(run, id=runs[one][seed].id) for seed, run in runs[three].items()}
     save_results(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: slower, three: solved}))
     read = load_kept_results(tmp_path / "kept.json")
     for seed, run in read.runs[one].items():
@@ -98,8 +87,7 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: KeptResul
         assert read.runs[three][seed].means != run.means
     assert format_results(read) == (tmp_path / "kept.json").read_text()
     flags = make_table(replace(sweep, control=one), read.select_runs(sweep)).flags
-    (said,) = (flag for flag in flags if "are one run" in flag)
-    assert said == f"'{two}' and '{one}' are one run: they differ only in deployment and costs"
+    assert f"'{two}' and '{one}' are one run: they differ only in deployment and costs" in flags
 
 
 def test_results_with_further_runs_are_not_replaced(kept: KeptResults):
@@ -112,14 +100,14 @@ def test_results_with_further_runs_are_not_replaced(kept: KeptResults):
 
 
 def test_kept_results_hold_no_path_of_a_machine():
-    words = ("data.root=/home/me/data/cmu", "data.root=outputs/data/cmu", "+data.body=/x/model.npz")
-    places = "hydra.searchpath=[file:///home/me/conf, file://near, file:///x/b]"
-    assert shorten_paths([places]) == ("hydra.searchpath=[file://.../conf, file://near, file://.../b]",)
-    assert shorten_paths(words) == (
-        "data.root=.../cmu",
-        "data.root=outputs/data/cmu",
-        "+data.body=.../model.npz",
-    )
+    for word, kept in {
+        "hydra.searchpath=[file:///me/conf, file://near, file:///x/b]":
+            "hydra.searchpath=[file://.../conf, file://near, file://.../b]",
+        "data.root=/home/me/data/cmu": "data.root=.../cmu",
+        "data.root=outputs/data/cmu": "data.root=outputs/data/cmu",
+        "+data.body=/x/model.npz": "+data.body=.../model.npz",
+    }.items():  # fmt: skip
+        assert shorten_paths([word]) == (kept,)
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"sweep": "a"}', '{"runs": {"a": {}}}'])
@@ -132,8 +120,6 @@ def test_damaged_results_are_one_line(tmp_path: Path, text: str):
 
 def test_results_of_a_variant_with_other_overrides_are_rejected(sweep: Sweep, kept: KeptResults):
     """Otherwise its numbers would stand under a label that means something else now."""
-    other_two = {"2": ("memory=gru",)}
-    variants = [replace(one, overrides=other_two.get(one.label, one.overrides)) for one in sweep.variants]
-    other = replace(sweep, variants=tuple(variants))
+    other = [replace(one, overrides=("memory=gru",)) if one.label == "2" else one for one in sweep.variants]
     with pytest.raises(InputError, match="variant '2': overrides changed from"):
-        kept.select_runs(other)
+        kept.select_runs(replace(sweep, variants=tuple(other)))

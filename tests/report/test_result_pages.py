@@ -1,8 +1,7 @@
 """Pages of results: tables, and templates whose numbers and verdicts come from the tables."""
 
-from __future__ import annotations
-
 import functools
+import itertools
 import json
 import re
 from collections.abc import Sequence
@@ -31,15 +30,19 @@ def source(sweep: Sweep, kept: KeptResults) -> KeptTable:
     return KeptTable(kept, make_table(sweep, kept.select_runs(sweep), command=kept.command))
 
 
+def fill(template: str, table: KeptTable) -> str:
+    return make_pages({"t": table}, {"README.md": f"{template}\n"})["README.md"]
+
+
 def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept: KeptResults):
     made = source(sweep, kept)
     template = (
         'MPJPE {{ effect("t", "2", "stream", "MPJPE") }}; '
         '{{ value("t", "2", "stream", "MPJPE") }}. {{ verdict("t", "2, 4, 6", "window", "Jitter") }} '
         '{{ detectable("t", "stream", "MPJPE", "2") }} {% if has("u") %}never{% endif %}\n'
-        '{{ title("t") }}\n{{ origin("t") }}\n{{ summary("t") }}\n'
+        '{{ title("t") }}\n{{ origin("t") }}\n{{ summary("t") }}'
     )
-    text = make_pages({"t": made}, {"README.md": template})["README.md"]
+    text = fill(template, made)
     row = next(row for row in made.table.rows if row.label == "2")
     effect = row.cells["stream"]["MPJPE"].effect
     assert effect.verdict == Verdict.HOLDS
@@ -54,7 +57,7 @@ def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept
 def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: KeptResults):
     """Counted anew from the cells; an effect without a sign in the paper is not."""
     made = source(sweep, kept)
-    text = make_pages({"t": made}, {"README.md": '{{ held(["t"]) }}\n'})["README.md"]
+    text = fill('{{ held(["t"]) }}', made)
     cells = [row.cells["stream"][metric] for row in made.table.rows for metric in made.table.measured_metrics]
     signed = [cell for cell in cells if cell.paper_effect]
     holds = sum(cell.effect.verdict == Verdict.HOLDS for cell in signed)
@@ -76,8 +79,7 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
         return make_table(sweep, group_clips(kept.select_runs(sweep), ["."])[0])
 
     made = made._replace(regroup=coarser)
-    words = '{{ decided("t") }}, {{ decided("t", "a", "b") }}'
-    text = make_pages({"t": made}, {"README.md": f"{words}\n"})["README.md"].splitlines()[-1]
+    text = fill('{{ decided("t") }}, {{ decided("t", "a", "b") }}', made).splitlines()[-1]
     cells = [cell for row in made.table.rows for own in row.cells.values() for cell in own.values()]
     effects = [cell.effect for cell in cells if cell.effect and cell.effect.verdict]
     significant = sum(effect.holm < 0.05 for effect in effects)
@@ -85,21 +87,16 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
     assert text == f"{significant} of {len(effects)}, 0 of {len(effects)}"
 
 
-@pytest.mark.parametrize(
-    ("template", "words"),
-    [
-        ('{{ effect("u", "2", "stream", "MPJPE") }}', "'u'"),
-        ('{{ effect("t", "3", "stream", "MPJPE") }}', "'3'"),
-        ('{{ effect("t", "2", "live", "MPJPE") }}', "'live'"),
-        ('{{ effect("t", "2", "stream", "MPJ") }}', "'MPJ'"),
-        ('{{ decided("t", "a") }}', "t: "),
-        ("{{ nothing }}", "'nothing' is undefined"),
-        ("{{ effect(", "README.md"),
-    ],
-)
+@pytest.mark.parametrize(("template", "words"), [
+    ('{{ effect("u", "2", "stream", "MPJPE") }}', "'u'"),
+    ('{{ effect("t", "3", "stream", "MPJPE") }}', "'3'"),
+    ('{{ effect("t", "2", "live", "MPJPE") }}', "'live'"),
+    ('{{ effect("t", "2", "stream", "MPJ") }}', "'MPJ'"), ('{{ decided("t", "a") }}', "t: "),
+    ("{{ nothing }}", "'nothing' is undefined"), ("{{ effect(", "README.md"),
+])  # fmt: skip
 def test_bad_templates_are_one_line(sweep: Sweep, kept: KeptResults, template: str, words: str):
     with pytest.raises(InputError, match=re.escape(words)) as raised:
-        make_pages({"t": source(sweep, kept)}, {"README.md": template})
+        fill(template, source(sweep, kept))
     assert str(raised.value).startswith("README.md")
     assert "\n" not in str(raised.value)
 
@@ -123,38 +120,30 @@ def test_pages_of_the_clone_are_made_again_byte_for_byte():
 def test_every_interval_of_the_clone_follows_from_what_is_kept():
     """As many intervals as the pages print are computed here from the per-clip results, and are equal."""
     for name in ("mix", "networks", "table14"):  # the first two have several sources
-        one = clones_tables()[name]
-        text, printed = (DOCS / f"{name}.md").read_text(encoding="utf-8"), []
+        one, printed = clones_tables()[name], 0
         content = json.loads((DOCS / "data" / f"{name}.json").read_text())
         sources_of = [None, *(one.kept.sources if one.by_source else ())]
         for source_name, table in zip(sources_of, (one.table, *one.by_source), strict=True):
-            for row in table.rows:
-                for mode, cells in row.cells.items():
-                    for metric, cell in cells.items():
-                        if cell.effect is not None and cell.effect.low is not None:
-                            interval = by_hand(content, row, table, mode, metric, source_name)
-                            assert (cell.effect.low, cell.effect.high) == pytest.approx(interval)
-                            printed.append(interval)
-        assert len(re.findall(r"\\\[[^\]]*\d, [^\]]*\d\\\]", text)) == len(printed)
+            for row, mode in itertools.product(table.rows, table.modes):
+                for metric, cell in row.cells.get(mode, {}).items():
+                    if cell.effect is not None and cell.effect.low is not None:
+                        interval = by_hand(content, row, table, mode, metric, source_name)
+                        assert (cell.effect.low, cell.effect.high) == pytest.approx(interval)
+                        printed += 1
+        text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+        assert len(re.findall(r"\\\[[^\]]*\d, [^\]]*\d\\\]", text)) == printed
 
 
-def by_hand(
-    content: dict, row, table, mode: str, metric: str, source: str | None = None
-) -> tuple[float, float]:
+def by_hand(content: dict, row, table, mode: str, metric: str, source: str | None) -> tuple[float, float]:
     """Compute the interval of a row's difference from its control, from a file's content alone.
 
     source: whose clips count; None for all.
     """
     branches = {other.label: other.branch for other in table.rows}
-    seeds = sorted(set(content["cells"][row.label]) & set(content["cells"][row.against]))
-    every = {
-        label: [content["runs"][content["cells"][label][seed]] for seed in seeds]
-        for label in (row.label, row.against)
-    }
-    clips = [
-        {clip: (group, *rest) for clip, group, *rest in content["clips"][runs[0]["clips"]]}
-        for runs in every.values()
-    ]
+    cells = {label: content["cells"][label] for label in (row.label, row.against)}
+    seeds = sorted(set(cells[row.label]) & set(cells[row.against]))
+    every = {label: [content["runs"][by_seed[seed]] for seed in seeds] for label, by_seed in cells.items()}
+    clips = [{clip: rest for clip, *rest in content["clips"][runs[0]["clips"]]} for runs in every.values()]
     groups = {
         clip: group
         for clip, (group, *rest) in clips[0].items()
@@ -162,10 +151,8 @@ def by_hand(
     }
     sides = []
     for (label, runs), names in zip(every.items(), clips, strict=True):
-        place = {clip: at for at, clip in enumerate(names)}
-        places = [place[clip] for clip in groups]
-        errors = [run["errors"][mode][branches[label]][metric] for run in runs]
-        sides.append(np.array(errors)[:, places])
+        places = [list(names).index(clip) for clip in groups]
+        sides.append(np.array([run["errors"][mode][branches[label]][metric] for run in runs])[:, places])
     differences = (sides[0] - sides[1])[None]
     half = estimate_error(differences, np.array(list(groups.values()))).compute_half_width(0.05)[0]
     return float(differences.mean() - half), float(differences.mean() + half)
@@ -178,19 +165,17 @@ def test_the_way_from_the_first_variant_to_the_last_is_the_sum_of_its_steps(swee
     variants = tuple(replace(variant, against=against.get(variant.label)) for variant in sweep.variants)
     chained = replace(sweep, variants=variants, control=labels[0])
     find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
-    words = Placeholders(
-        {"t": source(chained, KeptResults("table14", (), runs_of(chained, find), list_overrides(chained)))}
-    )
+
+    def make_words(one: Sweep) -> Placeholders:
+        kept = KeptResults("table14", (), runs_of(one, find), list_overrides(one))
+        return Placeholders({"t": source(one, kept)})
+
+    words = make_words(chained)
     rows = [line.split(" | ") for line in words.steps("t").splitlines()[2:]]
-    assert [row[0].strip("| ") for row in rows] == [
-        labels[1], labels[0], f"total, from {labels[2]}"
-    ]  # fmt: skip
+    assert [row[0].strip("| ") for row in rows] == [labels[1], labels[0], f"total, from {labels[2]}"]
     column = 1 + chained.metrics.index("MPJPE")
     parts = [[word.replace(MINUS, "-") for word in row[column].split(", ")] for row in rows]
     assert float(parts[0][0]) + float(parts[1][0]) == pytest.approx(float(parts[2][0]), abs=0.011)
     assert [part[1] for part in parts[:2]] == ["67 %", "33 %"]  # 1.3 to 1.1 to 1
     assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
-    plain = Placeholders(
-        {"t": source(sweep, KeptResults("table14", (), runs_of(sweep, find), list_overrides(sweep)))}
-    )
-    assert plain.steps("t") == ""
+    assert make_words(sweep).steps("t") == ""

@@ -1,8 +1,7 @@
 """What a run records of where it ran."""
 
-from __future__ import annotations
-
 import json
+import platform
 import subprocess
 from pathlib import Path
 
@@ -20,17 +19,13 @@ from memmlp.runs.run import Run
 
 
 def test_environment_says_what_ran_without_the_machines_name():
-    import platform
-
     found = describe_environment()
     assert {"version", "git", "python", "packages", "platform", "cpu", "cores", "host"} == set(found)
     assert found["packages"]["torch"].startswith("2.")
     assert platform.node() not in json.dumps(found)
 
 
-def test_code_that_is_edited_while_it_runs_is_recorded_as_it_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_code_that_is_edited_while_it_runs_is_recorded_as_it_runs(tmp_path: Path, monkeypatch):
     """A worker does many runs with what it imported, whatever its files say later."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lab_of_mine.py").write_text("A = 1\n")
@@ -50,10 +45,8 @@ def test_a_file_is_parsed_only_if_its_bytes_differ(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(module, "compute_code_digest", lambda code: parsed.append(code) or digest(code))
     assert module.list_changed_files(manifest) == ["changed.py", "mixed.py"]
     assert sorted(parsed) == [b"A = 1", b"A = 1  # one", b"A = 2"]  # of mixed.py, comment.py and changed.py
-    assert module.list_changed_files({"sources": manifest["sources"]}) == [
-        "changed.py",
-        "mixed.py",
-    ]  # older runs
+    older = {"sources": manifest["sources"]}
+    assert module.list_changed_files(older) == ["changed.py", "mixed.py"]
     assert module.list_changed_files({}) == []
 
 
@@ -83,12 +76,10 @@ CODES, PART, NETWORK = (letter * 16 for letter in "abc")
 
 def trained(outputs: Path, name: str, prerequisite: Run | None = None, weights: str = "w", **facts) -> Run:
     run = Run.from_id(outputs, name)
-    above = (
-        {"prerequisite_runs": list_prerequisite_origins(prerequisite.manifest, prerequisite.weights_digest)}
-        if prerequisite
-        else {}
-    )
-    run.begin("vqvae", {}, data="d", prerequisite=prerequisite.id if prerequisite else None, **facts, **above)
+    if prerequisite:
+        origins = list_prerequisite_origins(prerequisite.manifest, prerequisite.weights_digest)
+        facts |= {"prerequisite_runs": origins}
+    run.begin("vqvae", {}, data="d", prerequisite=prerequisite.id if prerequisite else None, **facts)
     run.model.write_text(weights)
     run.finish([run.model.name])
     return run

@@ -1,7 +1,5 @@
 """A run's evaluations: which of them count, joined without mixing two kinds of inverse kinematics."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -19,7 +17,6 @@ from memmlp.runs.run import Run
 
 
 def solved(run: Run, ik: str, value: float, iterations: int | None = None, made: str = "1") -> None:
-    """Write an evaluation with inverse kinematics."""
     settings = {"mode": "stream", "ik": ik} | ({"ik_iterations": iterations} if iterations else {})
     errors = {"rotation": {"MPJPE": 9.0}, "combined": {"MPJPE": value, f"of {ik}": value}}
     clips = [{"name": "a", "frames": 60, **errors}]
@@ -39,11 +36,9 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
         read = load_measured_run(run.folder)
         keys = {key: value for key, value in build_record(run).items() if "combined" in key}
         return (
-            run.results["stream"]["combined"],
-            read.means["stream"]["combined"],
-            run.configured_evaluations.combined_solvers,
-            keys,
-        )
+            run.results["stream"]["combined"], read.means["stream"]["combined"],
+            run.configured_evaluations.combined_solvers, keys,
+        )  # fmt: skip
 
     both = {"MPJPE": 2.0, "of arms": 2.0}
     named = {f"stream.combined-arms.{key}": value for key, value in both.items()}
@@ -60,13 +55,8 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
 
 def test_a_mode_that_was_measured_by_an_earlier_recipe_says_so(tmp_path: Path, monkeypatch):
     settings = {"mode": "stream", "ik": "off"}
-    report = {
-        "mode": "stream",
-        "settings": settings,
-        "mean": {},
-        "clips": [],
-        "component_versions": {"mode.stream": 1},
-    }
+    report = {"mode": "stream", "settings": settings, "mean": {}, "clips": []}
+    report["component_versions"] = {"mode.stream": 1}
     write_report(tmp_path / f"{hash_evaluation_settings(settings)}.json", report)
     monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "mode.stream", 1)
     assert ConfiguredEvaluations(tmp_path, {}).outdated == {}

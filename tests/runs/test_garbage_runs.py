@@ -1,7 +1,5 @@
 """What may go and what stays."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -16,9 +14,7 @@ from memmlp.runs.run import Run
 FAILED, OLD, GONE, CODES, USED, GOOD, EMPTY = (f"{letter}" * 16 for letter in "0123456")
 
 
-def made(
-    outputs: Path, name: str, kind: str = "memmlp", prerequisite: str | None = None, version: int = 1
-) -> Run:
+def made(outputs, name: str, kind: str = "memmlp", prerequisite: str | None = None, version: int = 1) -> Run:
     run = Run.from_id(outputs, name)
     run.begin(kind, {}, data="d", prerequisite=prerequisite, component_versions={"metrics": version})
     run.model.write_bytes(b"weights")
@@ -28,7 +24,6 @@ def made(
 
 @pytest.fixture
 def outputs(tmp_path: Path) -> Path:
-    """One run of each sort."""
     Run.from_id(tmp_path, FAILED).begin("memmlp", {}, data="d", prerequisite=None)
     Run.from_id(tmp_path, FAILED).fail("loss is nan")
     made(tmp_path, OLD, version=0)
@@ -51,9 +46,7 @@ def found(outputs: Path, *kinds: str) -> dict[str, str]:
 
 
 def test_failed_old_and_orphaned_runs_may_go(outputs: Path):
-    assert found(outputs) == {
-        FAILED: "failed", OLD: "old", CODES: "orphaned", EMPTY: "orphaned",
-    }  # fmt: skip
+    assert found(outputs) == {FAILED: "failed", OLD: "old", CODES: "orphaned", EMPTY: "orphaned"}
     assert found(outputs, "failed") == {FAILED: "failed"}
 
 
@@ -75,15 +68,12 @@ def test_deleted_is_the_folder_and_no_other_unless_it_was_marked_meanwhile(outpu
     assert {path.name for path in (outputs / "runs").iterdir()} == before - {FAILED}
 
 
-@pytest.mark.parametrize(
-    ("file", "content"),
-    [
-        ("plan.json", "{"),
-        ("plan.json", '{"entries": [], "tasks": []}'),  # its data is not there
-        ("plan.json", '{"entries": [{"label": "a", "seed": 1, "id": "0"}]}'),  # for another seed
-        ("entries.json", "{"),
-    ],
-)
+@pytest.mark.parametrize(("file", "content"), [
+    ("plan.json", "{"),
+    ("plan.json", '{"entries": [], "tasks": []}'),  # its data is not there
+    ("plan.json", '{"entries": [{"label": "a", "seed": 1, "id": "0"}]}'),  # for another seed
+    ("entries.json", "{"),
+])  # fmt: skip
 def test_a_plan_that_does_not_name_a_run_condemns_none(outputs: Path, file: str, content: str):
     (outputs / "sweeps" / "mine" / file).write_text(content)
     assert {GONE, GOOD} & set(found(outputs)) == set()
@@ -117,14 +107,8 @@ def test_a_network_upon_an_older_vqvae_may_go(tmp_path: Path, monkeypatch: pytes
     """Its own component versions do not include those of its prerequisite runs."""
     run = Run.from_id(tmp_path, OLD)
     above = [{"id": CODES, "component_versions": {"codebook.ema": VERSIONS["codebook.ema"]}}]
-    run.begin(
-        "memmlp",
-        {},
-        data="d",
-        prerequisite=None,
-        component_versions={"memory.vq": 1},
-        prerequisite_runs=above,
-    )
+    versions = {"component_versions": {"memory.vq": 1}, "prerequisite_runs": above}
+    run.begin("memmlp", {}, data="d", prerequisite=None, **versions)
     assert found(tmp_path, "old") == {}
     monkeypatch.setitem(VERSIONS, "codebook.ema", VERSIONS["codebook.ema"] + 1)
     assert found(tmp_path, "old") == {OLD: "old"}

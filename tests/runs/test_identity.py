@@ -1,7 +1,5 @@
 """What counts for the id of a run, an evaluation and a deployment."""
 
-from __future__ import annotations
-
 import pytest
 from begun_runs import CONFIG, identity
 
@@ -55,8 +53,7 @@ def test_a_stage_has_an_id_of_its_own_keys():
     assert moved(evaluation__ik="lbfgs") == [False, True, False]
     assert moved(evaluation__ik_iterations=3) == [False, False, False]  # there is no inverse kinematics
     assert moved(evaluation__batch=1) == [False, False, False]
-    assert moved(export__a=2) == [False, False, True]
-    assert moved(optim__lr=1) == [True, False, False]
+    assert (moved(export__a=2), moved(optim__lr=1)) == ([False, False, True], [True, False, False])
     assert moved(memory__blend=1) == [False, True, True]
     rolled = {"rollout": {"name": "own_predictions"}, "memory": {"blend": 1}}
     assert identity(CONFIG | rolled) != identity(CONFIG | {**rolled, "memory": {"blend": 0}})

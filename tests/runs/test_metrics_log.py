@@ -1,7 +1,5 @@
 """The log of metrics survives kills and says what is broken."""
 
-from __future__ import annotations
-
 import errno
 import json
 import math

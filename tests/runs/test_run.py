@@ -1,7 +1,5 @@
 """Run folders: what a kill at any moment leaves."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from pathlib import Path
@@ -14,15 +12,9 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.ui.run_index import read_facts
+from memmlp.runs import identity
 from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import is_intact, write_report
-from memmlp.runs.identity import (
-    compute_deployment_id,
-    compute_evaluation_id,
-    hash_deployment_settings,
-    select_deployment_settings,
-    select_evaluation_settings,
-)
 from memmlp.runs.query import build_record
 from memmlp.runs.run import Run
 
@@ -79,8 +71,10 @@ def test_changed_weights_and_deployments_are_refused_and_lost_ones_are_made_agai
 
 def deploy(run: Run, made: str, measured: dict, **export) -> None:
     """Add a deployment with those settings of `export`, made at that time."""
-    settings = select_deployment_settings({"export": {"graph": "auto", "precision": "fp32", **export}})
-    place = run.deployment(hash_deployment_settings(settings))
+    settings = identity.select_deployment_settings(
+        {"export": {"graph": "auto", "precision": "fp32", **export}}
+    )
+    place = run.deployment(identity.hash_deployment_settings(settings))
     place.folder.mkdir(parents=True)
     write_json(
         place.latency, {"run": run.id, "settings": settings, "made": made, "artifacts": {}, **measured}
@@ -107,40 +101,41 @@ def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, gr
 
 def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """What is shown and deployed of a run, where some is of an older recipe, be it the later."""
-    run = begun(tmp_path)
-    config = {"export": {"graph": "naive", "precision": "int8"}, "evaluation": {}}
-    fp32 = {"export": {"graph": "naive", "precision": "fp32"}}
+    run, versions = begun(tmp_path), memmlp.runs.identity.VERSIONS
+    int8, fp32 = (
+        {"export": {"graph": "naive", "precision": one}, "evaluation": {}} for one in ("int8", "fp32")
+    )
 
     def make(config: dict, value: float, graph: bytes) -> None:
-        settings = select_evaluation_settings(config, "stream")
+        settings = identity.select_evaluation_settings(config, "stream")
         report = {"mode": "stream", "settings": settings, "mean": {"rotation": {"MPJPE": value}}, "clips": []}
-        write_report(run.evaluation(compute_evaluation_id(config, "stream")), report)
-        place = run.deployment(compute_deployment_id(config))
+        write_report(run.evaluation(identity.compute_evaluation_id(config, "stream")), report)
+        place = run.deployment(identity.compute_deployment_id(config))
         place.folder.mkdir(parents=True)
         for path in (place.onnx, *([place.int8] if graph == b"old" else [])):
             path.write_bytes(graph)
-        place.finish(
-            {"settings": select_deployment_settings(config), "int8": {"growth": 0.0, "jitter_growth": 0.0}}
-        )
+        accurate = {"growth": 0.0, "jitter_growth": 0.0}
+        place.finish({"settings": identity.select_deployment_settings(config), "int8": accurate})
 
+    newer = {name: versions[name] + 1 for name in ("metrics", "graph.naive")}
     with monkeypatch.context() as today:
-        today.setitem(memmlp.runs.identity.VERSIONS, "metrics", 2)
-        today.setitem(memmlp.runs.identity.VERSIONS, "graph.naive", 2)
+        for name, version in newer.items():
+            today.setitem(versions, name, version)
         make(fp32, 2.0, b"new")
-    make(config, 1.0, b"old")
+    make(int8, 1.0, b"old")
     assert run.results["stream"]["rotation"]["MPJPE"] == 1.0
-    monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "metrics", 2)
-    monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "graph.naive", 2)
+    for name, version in newer.items():
+        monkeypatch.setitem(versions, name, version)
     assert run.results["stream"]["rotation"]["MPJPE"] == 2.0
     assert load_measured_run(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
     assert run.preferred_onnx.read_bytes() == b"new"
 
 
 def test_verify_names_what_changed(tmp_path: Path):
-    run = begun(tmp_path)
-    for name in ("results.json", "clips.json", "latency.json"):
+    run, names = begun(tmp_path), ["clips.json", "latency.json", "results.json"]
+    for name in names:
         write_json(run.folder / name, {})
-    run.finish(["results.json", "clips.json", "latency.json"])
+    run.finish(names)
     place, report = run.deployment("fp32-0"), run.evaluation("stream-0")
     place.folder.mkdir(parents=True)
     place.onnx.write_bytes(b"graph")
@@ -152,27 +147,7 @@ def test_verify_names_what_changed(tmp_path: Path):
     (run.folder / "latency.json").unlink()
     place.onnx.write_bytes(b"other")
     report.write_text(report.read_text().replace("nan", "0.1"))
-    assert run.verify() == [
-        "clips.json", "latency.json", "deployments/fp32-0/step.onnx", "evaluations/stream-0.json"
-    ]  # fmt: skip
-
-
-def write_every_file(run: Run) -> None:
-    for name in Run.FILES:
-        path = run.folder / name.replace("*", "0")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text('{"any": 1}')
-
-
-def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
-    run = begun(tmp_path)
-    write_every_file(run)
-    (run.folder / ".checkpoint.safetensors.123.tmp").touch()
-    (run.folder / "notes.txt").touch()
-    run.finish(["results.json"])
-    run.reset()
-    assert [path.name for path in run.folder.iterdir()] == ["notes.txt"]
-    assert not run.done
+    assert run.verify() == [*names[:2], "deployments/fp32-0/step.onnx", "evaluations/stream-0.json"]
 
 
 def test_cleared_stages_leave_no_file_of_any_precision(tmp_path: Path):
@@ -185,22 +160,22 @@ def test_cleared_stages_leave_no_file_of_any_precision(tmp_path: Path):
     assert not run.evaluations.exists()
 
 
-def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: Path, monkeypatch):
+def test_a_reset_removes_the_runs_files_and_no_others_results_first(tmp_path: Path, monkeypatch):
     """At any moment, what is removed first is what was made from the rest."""
     run = begun(tmp_path)
-    write_every_file(run)
+    for name in Run.FILES:
+        path = run.folder / name.replace("*", "0")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text('{"any": 1}')
+    for name in (".checkpoint.safetensors.123.tmp", "notes.txt"):
+        (run.folder / name).touch()
     run.finish([])
     unlink, left, removed = Path.unlink, [], []
 
     def spy(path: Path, missing_ok: bool = False) -> None:
         removed.append(path.name)
         unlink(path, missing_ok=missing_ok)
-        results = [
-            run.checkpoint,
-            run.model,
-            *run.folder.glob("evaluations/*"),
-            *run.folder.glob("deployments/*/*"),
-        ]
+        results = [run.checkpoint, run.model, *run.folder.glob("[ed]*s/**/*.*")]
         left.append((run.manifest_path.exists(), any(one.exists() for one in results)))
 
     monkeypatch.setattr(Path, "unlink", spy)
@@ -208,6 +183,7 @@ def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: P
     assert removed[0] == "DONE"
     assert (False, True) not in left
     assert left[-1] == (False, False)
+    assert [path.name for path in run.folder.iterdir()] == ["notes.txt"]
 
 
 def test_a_resumed_run_keeps_its_start(tmp_path: Path):
@@ -219,12 +195,12 @@ def test_a_resumed_run_keeps_its_start(tmp_path: Path):
     assert run.config == CONFIG
 
 
-def test_a_damaged_config_is_named(tmp_path: Path):
+@pytest.mark.parametrize("text", ["a: [b", "5", "[]"])
+def test_a_damaged_config_is_named(tmp_path: Path, text: str):
     run = begun(tmp_path)
-    for text in ("a: [b", "5", "[]"):
-        run.config_path.write_text(text)
-        with pytest.raises(InputError, match=r"config\.yaml: cannot be read"):
-            _ = run.config
+    run.config_path.write_text(text)
+    with pytest.raises(InputError, match=r"config\.yaml: cannot be read"):
+        _ = run.config
 
 
 def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):

@@ -1,7 +1,5 @@
 """The controller: a fleet replaces what dies, is no larger than the work, and says why nothing lives."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Sweep files: what they mean, and the one-line errors about what they must not hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,12 +40,13 @@ def test_a_key_that_a_variant_sets_is_refused_on_the_command_line():
     assert parse_sweep("s", content).with_overrides(["~hand"]).command_line == ("~hand",)
 
 
-def test_seeds_of_the_command_line_replace_the_files():
-    sweep = parse_sweep("s", {"seeds": [0, 1], "variants": VARIANTS}).with_overrides(
-        ["seed=5,6,7", "profile=tiny"]
-    )
-    assert sweep.seeds == (5, 6, 7)
-    assert sweep.command_line == ("profile=tiny",)
+@pytest.mark.parametrize(
+    ("words", "seeds"),
+    [(["seed=5,6,7", "profile=tiny"], (5, 6, 7)), (["++seed=7"], (7,)), (["+seed=7"], (7,))],
+)
+def test_seeds_of_the_command_line_replace_the_files(words: list[str], seeds: tuple[int, ...]):
+    sweep = parse_sweep("s", {"seeds": [0, 1], "variants": VARIANTS}).with_overrides(words)
+    assert (sweep.seeds, sweep.command_line) == (seeds, tuple(words[1:]))
 
 
 def test_keys_that_no_sweep_takes_are_refused():
@@ -55,12 +54,6 @@ def test_keys_that_no_sweep_takes_are_refused():
     for override in ("paths.outputs=elsewhere", "save_predictions=all"):
         with pytest.raises(InputError, match=override.partition("=")[0]):
             sweep.with_overrides(["profile=tiny", override])
-
-
-def test_a_seed_that_is_added_is_one():
-    for override in ("++seed=7", "+seed=7"):
-        sweep = parse_sweep("s", {"seeds": [0, 1], "variants": VARIANTS}).with_overrides([override])
-        assert sweep.seeds == (7,)
 
 
 def test_axes_are_a_grid_over_every_variant():
@@ -84,28 +77,19 @@ def test_a_list_of_grids_gives_each_of_their_cells_once():
     variants = {"full": [], "none": {"overrides": ["memory=none"], "against": "full"}}
     axes = [{"a": [1, 2, 2], "b": [3]}, {"b": [3, 4], "a": [1]}]
     sweep = parse_sweep("s", {"variants": variants, "axes": axes})
-    assert [variant.cell for variant in sweep.variants[:3]] == [
-        ("a=1", "b=3"),
-        ("a=2", "b=3"),
-        ("b=4", "a=1"),
-    ]
-    assert len(sweep.variants) == 6
+    cells = [variant.cell for variant in sweep.variants[:3]]
+    assert (cells, len(sweep.variants)) == ([("a=1", "b=3"), ("a=2", "b=3"), ("b=4", "a=1")], 6)
     assert sweep.variants[4].label == "none, a=2, b=3"
     assert sweep.find_control(sweep.variants[4]) == "full, a=2, b=3"
     assert (sweep.variants[4].series, sweep.variants[4].own_overrides) == ("none", ("memory=none",))
-    assert (
-        parse_sweep("s", {"variants": variants, "axes": axes[0]}).variants
-        == sweep.variants[:2] + sweep.variants[3:5]
-    )
+    first = parse_sweep("s", {"variants": variants, "axes": axes[0]}).variants
+    assert first == sweep.variants[:2] + sweep.variants[3:5]
 
 
 CONTENT = {
-    "title": "Mine",
-    "notes": ["of two variants"],
-    "base": ["data=synthetic"],
-    "control": "none",
+    "title": "Mine", "notes": ["of two variants"], "base": ["data=synthetic"], "control": "none",
     "variants": {"none": ["memory=none"], "gru": ["memory=gru"]},
-}
+}  # fmt: skip
 
 
 def test_what_is_read_is_what_was_kept(tmp_path: Path):

@@ -1,7 +1,5 @@
 """Plans: what variants need of one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -9,34 +7,23 @@ import pytest
 from memmlp.sweep.plan import Entry, Forecast, Plan, RunTask, estimate_time, order_tasks
 
 
-def a_plan() -> Plan:
-    """Two variants on one VQ-VAE, the second behind a network that is a variant too, and one on nothing."""
-    tasks = (
-        RunTask("vqvae", "vqvae", {}),
-        RunTask("net", "memmlp", {}, "vqvae", ("stream",)),
-        RunTask("net", "memmlp", {}, "vqvae"),
-        RunTask("refined", "memmlp", {}, "net", ("stream",)),
-        RunTask("plain", "memmlp", {}, None, ("stream",)),
-    )
-    entries = [Entry(label, 0, run, ("stream",)) for label, run in VARIANTS.items()]
-    return Plan("s", Path("outputs"), tuple(entries), order_tasks(tasks))
-
-
-VARIANTS = {"network": "net", "refined": "refined", "plain": "plain"}
-
-
-def needed(*labels: str) -> list[str]:
-    part = a_plan().select_variants(labels)
-    assert {entry.label for entry in part.entries} == set(labels)
-    return [task.key for task in part.tasks]
-
-
 def test_variants_need_their_runs_and_their_prerequisites():
-    assert needed("plain") == ["plain stream"]
-    assert needed("network") == ["vqvae", "net stream"]
-    assert needed("refined") == ["vqvae", "net", "refined stream"]
-    assert needed() == []
-    assert a_plan().select_variants(VARIANTS) == a_plan()
+    """Two variants on one VQ-VAE, the second behind a network that is a variant too, and one on nothing."""
+    above = {"vqvae": None, "net": "vqvae", "refined": "net", "plain": None}
+    tasks = [RunTask(name, "memmlp", {}, one, ("stream",) * (name != "vqvae")) for name, one in above.items()]
+    tasks.insert(2, RunTask("net", "memmlp", {}, "vqvae"))
+    entries = tuple(Entry(f"{name}s", 0, name, ("stream",)) for name in above if name != "vqvae")
+    plan = Plan("s", Path("outputs"), entries, order_tasks(tasks))
+    needs = {
+        "plains": ["plain stream"],
+        "nets": ["vqvae", "net stream"],
+        "refineds": ["vqvae", "net", "refined stream"],
+    }
+    for label, keys in needs.items():
+        part = plan.select_variants([label])
+        assert ([one.label for one in part.entries], [task.key for task in part.tasks]) == ([label], keys)
+    assert plan.select_variants([]).tasks == ()
+    assert plan.select_variants(needs) == plan
 
 
 CODES, QUICK, SLOW = ("c" * 16,), ("a" * 16, "b" * 16), ("d" * 16, "e" * 16)
@@ -55,7 +42,6 @@ def plan(tmp_path: Path) -> Plan:
 
 
 def finish(plan: Plan, name: str, seconds: object) -> None:
-    """End a run that took so long."""
     task = next(task for task in plan.tasks if task.id == name)
     run = plan.get_run(task)
     run.begin(task.kind, {}, data="d", prerequisite=task.prerequisite)
@@ -64,20 +50,11 @@ def finish(plan: Plan, name: str, seconds: object) -> None:
     run.finish(["results.json"])
 
 
-def test_nothing_is_foretold_of_a_kind_of_which_nothing_has_finished(plan: Plan):
-    assert estimate_time(plan) is None
-    finish(plan, CODES[0], 10.0)
-    assert estimate_time(plan) is None
-
-
-def test_a_run_is_judged_by_its_variant(plan: Plan):
-    finish(plan, CODES[0], 10.0)
+def test_a_run_is_judged_by_its_variant_or_the_others(plan: Plan):
+    for kind in ("nothing", "a VQ-VAE alone"):
+        assert estimate_time(plan) is None, kind
+        finish(plan, CODES[0], 10.0)
     finish(plan, QUICK[0], {"train": 50.0, "evaluate": 10.0})
+    assert estimate_time(plan) == Forecast(60.0 + 2 * 60.0, finished=1)
     finish(plan, SLOW[0], {"train": 1000.0, "evaluate": 200.0})
     assert estimate_time(plan) == Forecast(60.0 + 1200.0, finished=2)
-
-
-def test_an_variant_without_a_finished_run_is_judged_by_the_others_and_counted(plan: Plan):
-    finish(plan, CODES[0], 10.0)
-    finish(plan, QUICK[0], 60.0)
-    assert estimate_time(plan) == Forecast(60.0 + 2 * 60.0, finished=1)

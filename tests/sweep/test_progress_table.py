@@ -1,7 +1,5 @@
 """The board of a sweep."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Sweep files: what may stand in them, and how a fault is named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -85,12 +83,10 @@ def test_what_is_wrong_is_named():
     "text", [b"variants: [", b"\xff\xfe", b"a: b: c", b"variants: {a: [], a: [memory=none]}"]
 )
 def test_a_file_that_is_no_yaml_is_named(tmp_path: Path, text: bytes):
-    path = tmp_path / "mine.yaml"
-    path.write_bytes(text)
-    with pytest.raises(InputError, match=r"mine\.yaml"):
-        load_sweep(path)
-    with pytest.raises(InputError, match=r"absent\.yaml"):
-        load_sweep(tmp_path / "absent.yaml")
+    (tmp_path / "mine.yaml").write_bytes(text)
+    for name in ("mine", "absent"):
+        with pytest.raises(InputError, match=rf"{name}\.yaml"):
+            load_sweep(tmp_path / f"{name}.yaml")
 
 
 KEYS = st.sampled_from([*sweep_file.KEYS, "x"])
@@ -102,7 +98,7 @@ VALUES = st.recursive(
 
 
 @pytest.mark.slow
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.dictionaries(KEYS, VALUES, max_size=6))
 def test_whatever_stands_in_it_is_a_sweep_or_one_line(content):
     try:

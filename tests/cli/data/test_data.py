@@ -1,11 +1,10 @@
 """`memmlp data synth`, `show`, `prepare` and `inspect`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
+from cli.conftest import write_random_clip
 from click.testing import CliRunner
 from conftest import one_line
 
@@ -13,7 +12,6 @@ import memmlp.cli.data as commands
 from memmlp.common.errors import InputError
 from memmlp.config.build_request import build_motion
 from memmlp.config.compose import compose_config
-from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.synthetic import synthesize_clip
@@ -66,9 +64,7 @@ def test_folders_in_training_and_in_test_are_reported(memmlp, tmp_path: Path):
     rng = np.random.default_rng(0)
     for person in ("anna", "ben"):
         for take in range(8):
-            poses = 0.05 * np.cumsum(rng.normal(size=(90, 22, 3)), 0)
-            clip = Clip("", poses, 0.01 * np.cumsum(rng.normal(size=(90, 3)), 0), 60.0)
-            write_clip(tmp_path / "own" / person / f"{take}.npz", clip)
+            write_random_clip(tmp_path / "own" / person / f"{take}.npz", rng)
     cache = str(tmp_path / "cache")
     prepared = memmlp("data", "prepare", str(tmp_path / "own"), "--out", cache, "data.split.test=0.4")
     for ran in (prepared, memmlp("data", "inspect", cache)):

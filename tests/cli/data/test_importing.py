@@ -1,7 +1,5 @@
 """`memmlp data import`, `verify` and `skeleton`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,22 +73,14 @@ def test_a_wrong_unit_is_reported_by_both(source: Path) -> None:
         assert "a.bvh: the legs are 0.32 m long" in run(source.parent, *words, code=code)
 
 
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        (("--fps", "fast"), "--fps fast"),
-        (("--fps", "waltz=60"), "--fps waltz=60.0"),
-        (("--fps", "60", "--fps", "30"), "--fps 30"),
-        (("--floor", "nan"), "--floor nan"),
-        (("--skeleton", "none.yaml"), "--skeleton none.yaml"),
-    ],
-)
+@pytest.mark.parametrize(("options", "key"), [
+    (("--fps", "fast"), "--fps fast"), (("--fps", "waltz=60"), "--fps waltz=60.0"),
+    (("--fps", "60", "--fps", "30"), "--fps 30"), (("--floor", "nan"), "--floor nan"),
+    (("--skeleton", "none.yaml"), "--skeleton none.yaml"),
+])  # fmt: skip
 def test_wrong_options_write_nothing(source: Path, options: tuple[str, ...], key: str) -> None:
     assert key in run(source.parent, "data", "import", "source", "--out", "out", *options, code=2)
     assert not (source.parent / "out").exists()
-
-
-# Maps
 
 
 def skeleton(*arguments: object):

@@ -1,7 +1,5 @@
 """A VRM avatar on the page: its bones stand where the joints are, whatever avatar it is."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Iterator
@@ -91,9 +89,7 @@ def browser() -> Iterator[Browser]:
     [(None, 1.0), (without_chest, 1.2), (of_vrm_0, 1.2)],
     ids=["own", "without chest", "VRM 0"],
 )
-def test_an_avatar_s_bones_are_where_the_joints_are(
-    browser: Browser, own: bytes, clip: TrackedClip, edit, size: float
-):
+def test_an_avatar_s_bones_are_where_the_joints_are(browser, own: bytes, clip, edit, size: float):
     """Within what whole millimetres leave; of a wearer of another size, too.
 
     An avatar that lacks bones stands otherwise, but all its bones have the right direction.

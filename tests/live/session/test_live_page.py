@@ -1,7 +1,5 @@
 """The page in a browser: it draws, stops, goes back, and fits a phone."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 from collections.abc import Iterator
@@ -87,9 +85,7 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
 
 
 @pytest.mark.parametrize(("worn", "what"), [(True, "trackers"), (False, "the clip")])
-def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
-    browser: Browser, clip: TrackedClip, worn: bool, what: str
-):
+def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser, clip, worn, what: str):
     browser.size(240, 200)  # nothing is clicked
     words = make_greeting(ClipSource(clip, 60), "tiny", remark="hardly trained" if worn else "")
     with LiveServer(Hub(words | {"wearer": worn}), 0) as server:
@@ -138,9 +134,7 @@ class Worn(ClipSource):
     has_wearer = True
 
 
-def test_the_wearer_fits_the_stream_from_the_page(
-    browser: Browser, network: Path, clip: TrackedClip, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_wearer_fits_the_stream_from_the_page(browser, network: Path, clip: TrackedClip, monkeypatch):
     monkeypatch.setattr("memmlp.live.stream.FAR", 0.0)  # nobody stands so well in a T-pose
     source, stream = Worn(clip, 60), Stream(network)
     hub = Hub(make_greeting(source, "tiny"))
@@ -184,5 +178,4 @@ def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: T
         browser.wait("document.querySelector('#about').textContent == 'tiny · person at 60 Hz'")
         browser.click("#calibrate")
         until(lambda: asked, "an order")
-    assert asked == [{"action": "calibrate", "value": None}]
-    assert browser.errors == []
+    assert (asked, browser.errors) == ([{"action": "calibrate", "value": None}], [])

@@ -1,7 +1,5 @@
 """The loop's messages, and orders of the page: their effect on the stream, when, and what is saved."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Mapping
@@ -57,14 +55,11 @@ def test_a_calibration_waits_for_its_countdown(worn: Wearing):
     worn.order("calibrate")
     worn.fitting.step(worn.pose(0.2))
     assert worn.states[-1]["waiting"] == {"action": "calibrate", "seconds": COUNTDOWN}
-    worn.now += COUNTDOWN - 0.1
-    worn.fitting.step(worn.pose(0.2))
-    assert worn.stream.offsets is None
-    worn.now += 0.2
-    worn.fitting.step(None)  # no sample came
-    assert worn.stream.offsets is None
+    for seconds, pose in ((COUNTDOWN - 0.1, worn.pose(0.2)), (0.2, None)):  # at its end no sample came
+        worn.now += seconds
+        worn.fitting.step(pose)
+        assert worn.stream.offsets is None
     worn.fitting.step(worn.pose())
-    assert worn.stream.offsets is not None
     state = worn.states[-1]
     assert (state["waiting"], state["file"]) == (None, "me.json")
     assert (state["calibrated"], state["failed"]) == (True, False)
@@ -150,9 +145,6 @@ def test_forgotten_and_cancelled(worn: Wearing):
     assert (worn.states[-1]["waiting"], worn.states[-1]["calibrated"]) == (None, False)
 
 
-# The loop
-
-
 class Instant(ClipSource):
     """A clip that is played without waiting, by a clock of its own; at its end it stops the loop."""
 
@@ -184,7 +176,6 @@ class Losing(Instant):
 
 
 def played(network: Path, clip: TrackedClip, hz: float, kind: type[Instant] = Instant) -> tuple[list, list]:
-    """Return the messages about a clip, and the lines that were printed."""
     stopped, messages, said = threading.Event(), [], []
     run_loop(Stream(network), kind(clip, hz, stopped), messages.append, stopped, report=said.append)
     return messages, said
@@ -218,11 +209,9 @@ def test_held_trackers_and_malformed_samples_are_counted(network: Path, clip: Tr
 class InMilliseconds(Instant):
     """A clip whose sender takes milliseconds for seconds."""
 
-    origin = 0.0
-
     def read(self) -> SourceSample | None:
         sample = super().read()
-        return sample._replace(time=self.origin + 1000 * sample.time)
+        return sample._replace(time=1000 * sample.time)
 
 
 def test_times_in_milliseconds_are_reported_once(network: Path, clip: TrackedClip):

@@ -1,7 +1,5 @@
 """The page's server, with plain HTTP clients."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import struct
@@ -141,8 +139,7 @@ def test_at_another_address_everything_needs_the_token(clip: TrackedClip):
         assert (entered.status, entered.headers["Location"]) == (303, "/")
         cookie = entered.headers["Set-Cookie"].partition(";")[0]
         response = get(server, "/events", Cookie=cookie)
-        assert response.status == 200
-        assert next(events(response))[0] == "greeting"
+        assert (response.status, next(events(response))[0]) == (200, "greeting")
         assert "0.0.0.0" not in server.url  # which nobody can open from elsewhere
 
 

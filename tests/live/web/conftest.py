@@ -1,26 +1,20 @@
 """A site of a tiny network, made once, and what of npm's packages its tests need."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import exported
 import numpy as np
 import pytest
-import tiny
 import wearer
 from conftest import shared
 from filelock import FileLock
 
 from memmlp.common.errors import InputError
 from memmlp.common.npm import ONNXRUNTIME_WEB, Package, read_package_files
-from memmlp.deploy.export import export
 from memmlp.live.web.site import Site, SiteNetwork, pack_clip
-from memmlp.networks.memory import NoMemory
-from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming import make_streaming_graph
 
 RUN = "0123456789abcdef"
 REMARK = "hardly trained, in a test"
@@ -34,10 +28,6 @@ class Made(NamedTuple):
     step: Path
 
 
-def network() -> MotionModel:
-    return wearer.at_ease(tiny.model(NoMemory), PERSON.frames)
-
-
 def package_files(package: Package, *names: str) -> list[bytes]:
     """Files of an npm package; skips where they cannot be had."""
     try:
@@ -48,19 +38,15 @@ def package_files(package: Package, *names: str) -> list[bytes]:
 
 
 @pytest.fixture(scope="session")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
+def site(tmp_path_factory: pytest.TempPathFactory, step_files: Callable[..., Path]) -> Made:
     """A site with a network to play and wear."""
     package_files(ONNXRUNTIME_WEB, "package.json")
-    home = shared(tmp_path_factory, "web")
-    made = Made(home / "site", home / "step.onnx")
-    with FileLock(home / "lock"):
-        if not made.step.exists():
+    made = Made(shared(tmp_path_factory, "web") / "site", step_files("no_memory"))
+    with FileLock(f"{made.folder}.lock"):
+        if not made.folder.exists():
             clip = pack_clip("walk", PERSON.frames.numpy(), 4.0)
-            Site(
-                networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,), REMARK)],
-                clips=[clip],
-            ).write(made.folder)
-            export(make_streaming_graph(network()), made.step, RUN)
+            network = exported.NETWORKS["no_memory"]()
+            Site([SiteNetwork(RUN, "tiny", RUN, network, (clip.key,), REMARK)], [clip]).write(made.folder)
     return made
 
 

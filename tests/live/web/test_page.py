@@ -1,7 +1,5 @@
 """The site in a browser with a headset in software: worn, played, and all offline."""
 
-from __future__ import annotations
-
 import functools
 import json
 import threading
@@ -15,8 +13,10 @@ from chromium import Browser
 from live.web.conftest import PERSON, REMARK, Made, package_files
 
 from memmlp.common.npm import IWER
+from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Offsets
+from memmlp.live.web.site import NUMBERS, pack_clip
 
 pytestmark = pytest.mark.slow
 
@@ -29,9 +29,10 @@ TAPE = """import('./stream.js').then(({ Stream }) => {
     const made = step.apply(this, given);
     const noted = { trackers: given.slice(0, 3), time: given[3] };
     window.tape.push(noted);
-    made.then(({ held, fresh, positions }) => {
+    const note = ({ held, fresh, positions }) => {
       Object.assign(noted, { held, positions: fresh ? [...positions] : null });
-    });
+    };
+    made.then(note, () => {}); // the page closes the worker while it still computes
     return made;
   };
   Stream.prototype.calibrate = function (...given) {
@@ -94,7 +95,9 @@ def test_it_is_worn_and_played_without_the_server(site: Made):
         browser.before(NOTE)
         server = Server(site.folder)
         try:
-            check_without_headset(server.url)
+            with Browser(360, 280) as without_headset:  # where nothing can be worn, it opens on the clips
+                without_headset.open(server.url)
+                without_headset.wait(f"{OPEN} == '#/play'")
             browser.open(server.url)
             browser.wait(f"{OPEN} == '#/vr'")
             browser.wait(f"{SITE}.offline == 'ready' && {SITE}.vr == 'ready'")
@@ -107,15 +110,7 @@ def test_it_is_worn_and_played_without_the_server(site: Made):
         assert browser.errors == []
 
 
-def check_without_headset(url: str) -> None:
-    """Where nothing can be worn, the site opens on the clips."""
-    with Browser(360, 280) as browser:
-        browser.open(url)
-        browser.wait(f"{OPEN} == '#/play'")
-
-
 def go(browser: Browser, page: str, until: str) -> None:
-    """Load a page anew, from what the browser keeps, and wait for something."""
     origin = browser.value("location.origin")
     browser.open("about:blank")
     browser.open(f"{origin}/#/{page}")
@@ -124,24 +119,22 @@ def go(browser: Browser, page: str, until: str) -> None:
 
 def joints() -> list[list[dict[str, Any]]]:
     """The person's head and wrists, frame by frame, as the site's clip has them."""
-    from memmlp.live.web.site import NUMBERS, pack_clip
-
-    numbers = np.frombuffer(pack_clip("", PERSON.frames.numpy(), 4.0).content, "<f4").reshape(-1, NUMBERS)
+    rows = (
+        np.frombuffer(pack_clip("", PERSON.frames.numpy(), 4.0).content, "<f4").reshape(-1, NUMBERS).tolist()
+    )
     return [
-        [
-            {"position": row[3 * i :][:3].tolist(), "rotation": row[9 + 4 * i :][:4].tolist()}
-            for i in range(3)
-        ]
-        for row in numbers
-    ]  # fmt: skip
+        [{"position": row[3 * i :][:3], "rotation": row[9 + 4 * i :][:4]} for i in range(3)] for row in rows
+    ]
+
+
+def read_body(site: Made) -> dict[str, Any]:
+    return json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]
 
 
 def t_pose(site: Made) -> list[dict[str, Any]]:
-    body = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]
-    rest = np.array(body["rest"])
-    return [
-        {"position": place, "rotation": [0, 0, 0, 1]} for place in (rest - [0, body["floor"], 0]).tolist()
-    ]
+    body = read_body(site)
+    places = (np.array(body["rest"]) - [0, body["floor"], 0]).tolist()
+    return [{"position": place, "rotation": [0, 0, 0, 1]} for place in places]
 
 
 def worn(browser: Browser, site: Made) -> dict[str, Any]:
@@ -153,7 +146,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     assert browser.value(REMARKED) == f"This network is {REMARK}."
     browser.resolved(TWO)
     browser.wait(f"{SITE}.vr == 'ready'")
-    height = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]["height"]
+    height = read_body(site)["height"]
     browser.value(f"document.querySelector('#height').value = {100 * height}")
     browser.resolved(TAPE)
     browser.value("document.querySelector('#immersive-vr').click()")
@@ -189,15 +182,14 @@ def check_wearer(recording: dict[str, Any], site: Made) -> None:
     assert len(calibrated) == 1
     begun = recording["samples"].index(calibrated[0])
     offsets = Offsets(*(calibrated[0]["calibrated"][key] for key in ("positions", "rotations")))
-    body = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]
-    height = body["height"] / calibrated[0]["scale"]
+    height = read_body(site)["height"] / calibrated[0]["scale"]
     stream, apart = Stream(site.step, space="openxr", height=height), []
     worn = recording["worn"]  # how the devices sat on the network's own body, laid as near as it can be
     np.testing.assert_allclose(offsets.rotations, worn["rotations"], atol=1e-5)
     np.testing.assert_allclose(offsets.positions[0], 2 / 3 * np.array(worn["positions"][0]), atol=1e-5)
     found = stream.calibrate(*given(calibrated[0]["at"]))
     np.testing.assert_allclose(found.positions, offsets.positions, atol=1e-5)
-    stream.offsets = matrices(offsets)
+    stream.offsets = Offsets(np.array(offsets.positions), quaternion_to_matrix(np.array(offsets.rotations)))
     for sample in recording["samples"][begun + 1 :]:
         if "held" not in sample:  # it still waited for the network
             break
@@ -212,12 +204,6 @@ def check_wearer(recording: dict[str, Any], site: Made) -> None:
 
 def given(trackers: list[dict[str, Any] | None]) -> list[Any]:
     return [t and (t["position"], t["rotation"]) for t in trackers]
-
-
-def matrices(offsets: Offsets) -> Offsets:
-    from memmlp.live.rotations import quaternion_to_matrix
-
-    return Offsets(np.array(offsets.positions), quaternion_to_matrix(np.array(offsets.rotations)))
 
 
 def check_play(browser: Browser) -> None:

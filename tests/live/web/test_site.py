@@ -1,7 +1,5 @@
 """The site's folder: what is in it, that it is whole or not there, and that nothing else is overwritten."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -92,29 +90,18 @@ def test_a_new_version_keeps_other_sites_below_its_address(node: str, tmp_path: 
     assert json.loads(said) == kept[:1]
 
 
-# Clips
-
-
 def test_it_is_the_middle_of_the_clip_in_the_page_s_axes():
-    clip = pack_clip("walk", PERSON.frames.numpy(), 1.0)
-    assert (clip.name, clip.frames) == ("walk", 60)
-    frames = PERSON.frames.numpy()
-    whole = pack_clip("a", frames, 9.0)
+    frames, space = PERSON.frames.numpy(), SPACES["openxr"]
+    clip, whole = pack_clip("walk", frames, 1.0), pack_clip("a", frames, 9.0)
+    assert (clip.name, clip.frames, whole.frames) == ("walk", 60, len(frames))
     assert whole.key == pack_clip("b", frames, 9.0).key != pack_clip("a", frames[1:], 9.0).key
-    assert whole.frames == len(frames)
     numbers = np.frombuffer(clip.content, "<f4").reshape(60, NUMBERS)
-    first = (len(PERSON.frames) - 60) // 2
-    space, middle = SPACES["openxr"], slice(first + 1, first + 61)  # frames have no first moment
-    np.testing.assert_allclose(
-        numbers[:, :9].reshape(-1, 3, 3),
-        space.convert_positions_from_amass(PERSON.positions[middle]),
-        atol=1e-6,
-    )
+    first = (len(frames) - 60) // 2
+    middle = slice(first + 1, first + 61)  # frames have no first moment
+    positions = space.convert_positions_from_amass(PERSON.positions[middle])
+    np.testing.assert_allclose(numbers[:, :9].reshape(-1, 3, 3), positions, atol=1e-6)
     rotations = quaternion_to_matrix(numbers[:, 9:21].reshape(-1, 4).astype(float)).reshape(-1, 3, 3, 3)
-    np.testing.assert_allclose(
-        rotations, space.convert_rotations_from_amass(PERSON.rotations[middle]), atol=1e-5
-    )
-    joints = PERSON.frames[first : first + 60, -66:].reshape(-1, 22, 3).numpy()
-    np.testing.assert_allclose(
-        numbers[:, 21:].reshape(-1, 22, 3), space.convert_positions_from_amass(joints), atol=1e-6
-    )
+    expected = space.convert_rotations_from_amass(PERSON.rotations[middle])
+    np.testing.assert_allclose(rotations, expected, atol=1e-5)
+    joints = space.convert_positions_from_amass(frames[first : first + 60, -66:].reshape(-1, 22, 3))
+    np.testing.assert_allclose(numbers[:, 21:].reshape(-1, 22, 3), joints, atol=1e-6)

@@ -1,7 +1,5 @@
 """The site's stream.js in node, with the site's own ONNX Runtime: the numbers of Python's Stream."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path
@@ -28,28 +26,21 @@ HEIGHT = 1.6  # metres, of another person than the network's
 def samples(times: np.ndarray, lost: dict[int, tuple[int, ...]] | None = None) -> list[dict[str, Any]]:
     """A person's trackers at times, some of them lost, as the page takes them."""
     person = wearer.person(times - times[0])
-    positions = SPACE.convert_positions_from_amass(person.positions)
-    rotations = matrix_to_quaternion(
-        SPACE.convert_rotations_from_amass(person.rotations).reshape(-1, 3, 3)
-    ).reshape(-1, 3, 4)
+    positions = SPACE.convert_positions_from_amass(person.positions).tolist()
+    turns = SPACE.convert_rotations_from_amass(person.rotations).reshape(-1, 3, 3)
+    rotations = matrix_to_quaternion(turns).reshape(-1, 3, 4).tolist()
     made = []
     for index, time in enumerate(times):
-        gone = (lost or {}).get(index, ())
-        trackers = [
-            None if k in gone else {"position": p.tolist(), "rotation": q.tolist()}
-            for k, (p, q) in enumerate(zip(positions[index], rotations[index], strict=True))
-        ]
+        gone, at = (lost or {}).get(index, ()), zip(positions[index], rotations[index], strict=True)
+        trackers = [None if k in gone else {"position": p, "rotation": q} for k, (p, q) in enumerate(at)]
         made.append({"time": float(time), "trackers": trackers})
     return made
 
 
 def jittered(seconds: float, hz: float) -> np.ndarray:
     """Times of a device whose clock is no good, among them one twice and one set back a little."""
-    times = (
-        100
-        + np.arange(0, seconds, 1 / hz)
-        + np.random.default_rng(0).uniform(-2e-3, 2e-3, round(seconds * hz))
-    )
+    jitter = np.random.default_rng(0).uniform(-2e-3, 2e-3, round(seconds * hz))
+    times = 100 + np.arange(0, seconds, 1 / hz) + jitter
     times[20], times[30] = times[19], times[29] - 0.1
     return times
 
@@ -84,14 +75,12 @@ def gone(first: int, end: int, *which: int) -> dict[int, tuple[int, ...]]:
 
 
 PARTS: dict[str, dict[str, Any]] = {
-    "60 Hz": {"samples": samples(np.arange(120) / 60)},
-    "72 Hz": {"samples": samples(np.arange(144) / 72)},
+    "60 Hz": {"samples": samples(np.arange(120) / 60)}, "72 Hz": {"samples": samples(np.arange(144) / 72)},
     "50 Hz, jittered": {"samples": samples(jittered(1.6, 50.0))},
     "22 Hz": {"samples": samples(np.arange(40) / 22)},
     "lost hands": {"samples": samples(np.arange(144) / 72, {**gone(30, 70, 1), **gone(60, 100, 1, 2)})},
     "lost head": {"samples": samples(np.arange(100) / 60, {**gone(0, 12, 0, 2), **gone(50, 80, 0)})},
-    "gaps": {"samples": samples(gaps())},
-    "bursts": {"samples": samples(bursts())},
+    "gaps": {"samples": samples(gaps())}, "bursts": {"samples": samples(bursts())},
     "calibrated": {"samples": samples(np.arange(90) / 90), "calibrate": t_pose(), "height": HEIGHT},
 }  # fmt: skip
 
@@ -163,9 +152,7 @@ def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_both_refuse_other_poses_than_a_t_pose_for_the_same_reason(
-    words: str, site: Made, answers: dict[str, Any]
-):
+def test_both_refuse_other_poses_than_a_t_pose_for_the_same_reason(words: str, site, answers: dict[str, Any]):
     with pytest.raises(InputError, match=words) as error:
         in_python(site.step, refused(words))
     said = answers[words]["refused"]

@@ -1,7 +1,5 @@
 """Sheets of clips: which clips, how many panels, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -34,8 +32,7 @@ def test_clips_are_evenly_spread(folder: Path, count: int, numbers: list[int]):
 def test_bad_files_are_named(folder: Path):
     (folder / "0" / "walk.npz").write_bytes(b"no")
     clips, skipped, _ = read_sample(folder, 7)
-    assert len(clips) == 6
-    assert [file.file for file in skipped] == ["0/walk.npz"]
+    assert (len(clips), [file.file for file in skipped]) == (6, ["0/walk.npz"])
     assert str(folder) not in skipped[0].reason
 
 

@@ -1,7 +1,5 @@
 """Drawn skeletons: colours of errors, and the body part in front."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny
@@ -31,7 +29,6 @@ def draw(camera: Camera, joints: np.ndarray, errors: np.ndarray | None) -> np.nd
 
 
 def at(picture: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarray:
-    """Return the colour at a point of the world."""
     right, up, _ = camera.project(point) * HEIGHT / camera.metres
     return picture[round(HEIGHT / 2 - up), round(WIDTH / 2 + right)]
 

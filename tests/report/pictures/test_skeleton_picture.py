@@ -1,7 +1,5 @@
 """The picture of a skeleton map: sides in their colours, the body beside it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,6 @@ from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT, write_s
 
 
 def columns(picture: np.ndarray, colour: str) -> np.ndarray:
-    """Return the columns of the pixels of just that colour."""
     rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
     return np.nonzero((picture == rgb).all(-1))[1]
 

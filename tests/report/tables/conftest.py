@@ -1,7 +1,5 @@
 """A sweep and its table for the tests of tables."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

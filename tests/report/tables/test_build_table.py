@@ -1,7 +1,5 @@
 """From a sweep and its runs to a table."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -25,39 +23,28 @@ def test_tables_need_no_torch():
 
 def test_variants_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
     """The control has clips of one source alone: on the other's, the next variant stands in its place."""
-    sweep = parse_sweep(
-        "mix",
-        {
-            "variants": {
-                "one": [],
-                "both": ["optim.lr=1"],
-                "more": {"overrides": ["optim.lr=2"], "against": "one"},
-            }
-        },
-    )
-    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
-    clips = list(next(iter(runs["one"].values())).clips)
-    halves = {clip: "old" if number % 2 else "new" for number, clip in enumerate(clips)}
-
-    def mixed(label: str) -> dict:
-        sources = dict.fromkeys(clips, "old") if label == "one" else halves
-        return {seed: replace(run, clip_sources=sources) for seed, run in runs[label].items()}
-
-    runs = {label: mixed(label) for label in runs}
+    more = {"overrides": ["optim.lr=2"], "against": "one"}
+    sweep = parse_sweep("mix", {"variants": {"one": [], "both": ["optim.lr=1"], "more": more}})
+    halves = {clip: "old" if number % 2 else "new" for number, clip in enumerate(CLIPS)}
+    runs = {
+        label: {
+            seed: replace(run, clip_sources=dict.fromkeys(CLIPS, "old") if label == "one" else halves)
+            for seed, run in found.items()
+        }
+        for label, found in runs_of(sweep, fake_sweep(tmp_path, sweep)).items()
+    }
     part, part_runs, flags = restrict_to_source(sweep, runs, "new")
     assert (list(part_runs), part.control) == (["both", "more"], "both")
     assert flags == ("no test clip of new, so left out: 'one'",)
-    waiting, left, _ = restrict_to_source(
-        sweep, runs | {"both": {}}, "new"
-    )  # a variant without a run is no control
-    assert (list(left), waiting.control) == (["both", "more"], "more")
+    waiting, left, _ = restrict_to_source(sweep, runs | {"both": {}}, "new")
+    assert (list(left), waiting.control) == (["both", "more"], "more")  # one without a run is no control
     table = make_table(part, part_runs)
     assert [row.label for row in table.rows] == ["both", "more"]
     assert not any("missing" in flag for flag in table.flags)
     old, old_runs, flags = restrict_to_source(sweep, runs, "old")
     assert (list(old_runs), old.variants, flags) == (["one", "both", "more"], sweep.variants, ())
     assert "test clips of old alone" in old.title
-    assert all(len(run.clips) == len(clips) // 2 for run in old_runs["both"].values())
+    assert all(len(run.clips) == len(CLIPS) // 2 for run in old_runs["both"].values())
     with pytest.raises(InputError, match=r"--source third: no finished run .* must be new or old"):
         restrict_to_source(sweep, runs, "third")
 
@@ -96,13 +83,3 @@ def test_a_mode_in_which_nothing_was_measured_is_left_out(tmp_path: Path):
     assert make_table(sweep, streamed).modes == ("stream",)
     assert make_table(sweep, {**streamed, "both": runs["both"]}).modes == ("stream", "window")
     assert make_table(sweep, streamed, ["window"]).modes == ("window",)
-
-
-def written(folder: Path) -> Path:
-    """A sweep's file: two variants, three seeds."""
-    path = folder / "mine.yaml"
-    path.write_text(
-        "title: Mine\nseeds: [0, 1, 2]\ncontrol: full\nmetrics: [MPJPE]\n"
-        "variants:\n  full: []\n  none: ['memory=none']\n"
-    )
-    return path

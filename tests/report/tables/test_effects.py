@@ -1,7 +1,5 @@
 """Differences from controls, paired by seed and clip, their statistics and verdicts."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from dataclasses import replace
@@ -40,10 +38,8 @@ def test_difference_is_paired_by_seed_and_clip(sweep: Sweep, tmp_path: Path):
 
 
 def test_correction_is_over_all_modes_and_metrics(table: Table):
-    effects = [
-        c.effect for row in table.rows for cells in row.cells.values() for c in cells.values() if c.effect
-    ]
-    tested = [effect for effect in effects if effect.p is not None]
+    cells = [c for row in table.rows for cells in row.cells.values() for c in cells.values()]
+    tested = [c.effect for c in cells if c.effect and c.effect.p is not None]
     assert table.comparisons == len(tested) == 2 * 3 + 2 * 2  # the variant "by position" has no MPJRE
     smallest = min(tested, key=lambda effect: effect.p)
     assert smallest.holm == pytest.approx(min(1, smallest.p * len(tested)))
@@ -92,46 +88,34 @@ def test_confounded_rows_are_counted_apart(sweep: Sweep, tmp_path: Path):
 
 def test_what_would_have_been_found_is_so_after_the_table_s_own_correction(sweep: Sweep, tmp_path: Path):
     """A variant of one seed has no p-values, and so no share in the correction."""
-    find = fake_sweep(tmp_path, sweep, EFFECTS)
+    find, seen = fake_sweep(tmp_path, sweep, EFFECTS), []
+    for seeds, comparisons in (((0,), 6), ((), 6), (sweep.seeds, 10)):
 
-    def few(variant, seed):
-        return find(variant, seed) if variant.label != "by position" or seed == 0 else None
+        def some(variant, seed, seeds=seeds):
+            return find(variant, seed) if variant.label != "by position" or seed in seeds else None
 
-    def without(variant, seed):
-        return find(variant, seed) if variant.label != "by position" else None
-
-    tables = [table_of(sweep, some) for some in (few, without, find)]
-    assert [table.comparisons for table in tables] == [6, 6, 10]
-    seen = [cell(table, "no | memory", "MPJPE").effect.detectable for table in tables]
+        table = table_of(sweep, some)
+        assert table.comparisons == comparisons
+        seen.append(cell(table, "no | memory", "MPJPE").effect.detectable)
     assert seen[0] == seen[1] < seen[2]
 
 
 def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
     """Interval, correction, equivalence and verdict equal those that are put together here by hand."""
     find = fake_sweep(tmp_path, sweep, {"no | memory": 1.004, "by position": 1.05})
-    table, keys = (
-        table_of(sweep, find),
-        [("no | memory", "rotation", m) for m in ("MPJRE", "MPJPE", "Jitter")],
-    )
+    table, runs, p = table_of(sweep, find), runs_of(sweep, find), {}
+    keys = [("no | memory", "rotation", m) for m in ("MPJRE", "MPJPE", "Jitter")]
     keys += [("by position", "position", metric) for metric in ("MPJPE", "Jitter")]
-    p = {}
-    for mode in table.modes:
-        for label, branch, metric in keys:
-            sides = [
-                np.array(
-                    [
-                        read.get_clip_values(CLIPS, mode, b, metric)
-                        for read in runs_of(sweep, find)[one].values()
-                    ]
-                )
-                for one, b in ((label, branch), ("full_model", "rotation"))
-            ]
-            known = estimate_paired_effects((sides[0] - sides[1])[None])
-            effect = cell(table, label, metric, mode).effect
-            assert (effect.mean, effect.low, effect.high) == pytest.approx(
-                (known.mean[0], known.low[0], known.high[0])
-            )
-            p[label, mode, metric] = known.p[0]
+    for mode, (label, branch, metric) in itertools.product(table.modes, keys):
+        one, control = (
+            np.array([read.get_clip_values(CLIPS, mode, b, metric) for read in runs[name].values()])
+            for name, b in ((label, branch), ("full_model", "rotation"))
+        )
+        known = estimate_paired_effects((one - control)[None])
+        effect = cell(table, label, metric, mode).effect
+        expected = (known.mean[0], known.low[0], known.high[0])
+        assert (effect.mean, effect.low, effect.high) == pytest.approx(expected)
+        p[label, mode, metric] = known.p[0]
     corrected = dict(zip(p, correct_by_holm(np.array(list(p.values()))), strict=True))
     for (label, mode, metric), value in corrected.items():
         effect = cell(table, label, metric, mode).effect
@@ -187,18 +171,13 @@ def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
     table = table_of(source, find)
     rows = {row.label: row.branch for row in table.rows if not row.is_paper_only}
     assert rows == {"no | memory": "rotation", "by position": "position", "full_model": "combined"}
-    assert (
-        sum("no other branch, so the row shows rotation: 'no | memory'" in flag for flag in table.flags) == 1
-    )
+    assert len([flag for flag in table.flags if "row shows rotation: 'no | memory'" in flag]) == 1
     lines = " ".join(printed(table, 100).split())
     assert "combined; 'no | memory' rotation, 'by position' position" in lines
     assert "the text says so" not in lines  # the paper's values are of another branch
     assert cell(table, "full_model", "MPJPE").paper is None
-    assert {row.cells["stream"]["MPJPE"].effect.verdict for row in table.rows[1:3]} <= {
-        "higher",
-        "lower",
-        "inconclusive",
-    }
+    verdicts = {row.cells["stream"]["MPJPE"].effect.verdict for row in table.rows[1:3]}
+    assert verdicts <= {"higher", "lower", "inconclusive"}
     run = runs_of(source, find)["full_model"][0]
     assert cell(table, "full_model", "MPJPE").values[0] == run.get_value("stream", "combined", "MPJPE")
 
@@ -208,10 +187,10 @@ def test_a_branch_that_was_not_evaluated_is_no_other(sweep: Sweep, tmp_path: Pat
     find = fake_sweep(tmp_path, sweep, branches=["rotation", "position"])
     table = table_of(sweep.with_branch("combined"), find, command="memmlp sweep 11")
     assert cell(table, "full_model", "MPJPE").mean is None
-    assert (
+    words = (
         "not evaluated in the branch combined: 'no | memory', 'full_model'; evaluate with: memmlp sweep 11"
-        in (table.flags)
     )
+    assert words in table.flags
 
 
 def test_variants_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path):
@@ -234,9 +213,7 @@ def test_the_correction_is_the_same_whichever_mode_is_shown(sweep: Sweep, tmp_pa
 
 
 @pytest.mark.parametrize(("label", "word"), [("no | memory", "nan"), ("full_model", "inf")])
-def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(
-    sweep: Sweep, tmp_path: Path, label: str, word: str
-):
+def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(sweep, tmp_path, label: str, word: str):
     """A variant that diverged on a hard clip would be better for it; too short a clip takes no verdict."""
     find = fake_sweep(tmp_path, sweep, EFFECTS)
     before = table_of(sweep, find)

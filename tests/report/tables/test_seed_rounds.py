@@ -1,7 +1,5 @@
 """Rounds of seeds: who gets more, what is decided at which look, and how often that is wrong."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping
 
@@ -19,20 +17,9 @@ from memmlp.sweep.sweep_file import parse_sweep
 
 ORIGIN = Origin("c", False, "d", "cpu")
 CLIPS = [f"clip {number}" for number in range(10)]
+VARIANTS = {"full": [], "worse": ["a=1"], "same": ["a=2"], "unsure": ["a=3"], "paper": {"overrides": None}}
 SWEEP = parse_sweep(
-    "mine",
-    {
-        "seeds": [4, 2],
-        "control": "full",
-        "metrics": ["MPJPE", "FLOPs"],
-        "variants": {
-            "full": [],
-            "worse": ["a=1"],
-            "same": ["a=2"],
-            "unsure": ["a=3"],
-            "paper": {"overrides": None},
-        },
-    },
+    "mine", {"seeds": [4, 2], "control": "full", "metrics": ["MPJPE", "FLOPs"], "variants": VARIANTS}
 )
 TRUTH = {"full": 0.0, "worse": 2.0, "same": 0.0, "unsure": 0.09}  # the smallest effect of interest is 0.1
 
@@ -42,7 +29,6 @@ Draw = Callable[[str, int, str], np.ndarray]  # (label, seed, "mode metric") -> 
 def run(
     label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: Mapping[str, str]
 ) -> MeasuredRun:
-    """Make a finished run with these errors in both modes."""
     modes = ("stream", "window")
     numbers = {mode: {m: draw(label, seed, f"{mode} {m}") for m in metrics} for mode in modes}
     several = len(next(iter(numbers["stream"].values())))
@@ -106,9 +92,7 @@ def test_the_schedule_is_fixed_at_the_start():
     assert sum(rounds.levels) == pytest.approx(0.05)
     assert rounds.find_next_analyses(SWEEP) == {"worse": 0, "same": 0, "unsure": 0}
     spent = rounds.restrict_sweep(SWEEP)
-    assert {variant.label: spent.get_seeds(variant) for variant in spent.list_runnable()} == dict.fromkeys(
-        TRUTH, (4, 2, 5)
-    )
+    assert [spent.get_seeds(variant) for variant in spent.list_runnable()] == [(4, 2, 5)] * len(TRUTH)
     assert len(spent.list_variant_seeds()) == 12
     assert start_rounds(SWEEP, 1 + 2).schedule == (3,)
 
@@ -116,12 +100,8 @@ def test_the_schedule_is_fixed_at_the_start():
 def test_open_variants_and_their_control_alone_go_on():
     world = World()
     rounds = world.look(start_rounds(SWEEP))
-    assert verdicts(rounds) == {
-        "worse": ("higher", 3),
-        "same": ("equivalent", 3),
-        "unsure": ("inconclusive", 3),
-    }
-    assert rounds.find_next_analyses(SWEEP) == {"unsure": 1}
+    found = {"worse": ("higher", 3), "same": ("equivalent", 3), "unsure": ("inconclusive", 3)}
+    assert (verdicts(rounds), rounds.find_next_analyses(SWEEP)) == (found, {"unsure": 1})
     assert rounds.count_seeds(SWEEP) == {"full": 5, "worse": 3, "same": 3, "unsure": 5}
     rounds = world.to_the_end(rounds)
     assert [look.seeds for look in rounds.analyses] == [3, 5, 8, 13]
@@ -146,10 +126,7 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
     rounds = world.to_the_end(start_rounds(sweep, 5))
     assert rounds.count_seeds(sweep) == {"full": 3, "other": 5, "unsure": 5}
     assert verdicts(rounds)["other"] == ("higher", 3)
-    assert [f.label for f in rounds.analyses[1].findings] == [
-        "unsure",
-        "unsure",
-    ]  # it was not looked at again
+    assert [f.label for f in rounds.analyses[1].findings] == ["unsure"] * 2  # it was not looked at again
     table = make_table(rounds.restrict_sweep(sweep), world.runs, rounds=rounds)
     cell = next(row for row in table.rows if row.label == "other").cells["stream"]["MPJPE"]
     assert (cell.effect.verdict, cell.effect.decided) == (Verdict.HIGHER, 3)
@@ -182,12 +159,15 @@ def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
     assert few.to_the_end(whole) == many.to_the_end(whole)
 
 
-def test_one_group_of_clips_ends_it_at_once():
+def test_one_group_of_clips_ends_it_at_once_and_a_control_that_failed_before():
     world = World(groups=dict.fromkeys(CLIPS, "one take"))
     rounds = world.to_the_end(start_rounds(SWEEP))
     assert len(rounds.analyses) == 1
     assert {verdict for verdict, _ in verdicts(rounds).values()} == {"inconclusive"}
     assert rounds.find_next_analyses(SWEEP) == {}
+    world = World()
+    world.failing = {("full", 5)}
+    assert world.to_the_end(start_rounds(SWEEP)).analyses == ()
 
 
 def test_an_variant_whose_runs_failed_is_late_and_others_do_not_wait():
@@ -196,19 +176,11 @@ def test_an_variant_whose_runs_failed_is_late_and_others_do_not_wait():
     rounds = world.to_the_end(start_rounds(SWEEP, 5))
     assert [sorted(look.runs) for look in rounds.analyses] == [["same", "unsure"], ["unsure"]]
     assert rounds.find_next_analyses(SWEEP) == {"worse": 0}
-    assert (
-        len(rounds.list_comparison_keys(SWEEP)) == 6
-    )  # its comparisons count although they were not looked at
+    assert len(rounds.list_comparison_keys(SWEEP)) == 6  # its own count although they were not looked at
     world.failing = set()
     rounds = world.to_the_end(rounds)
     assert verdicts(rounds)["worse"] == ("higher", 3)
     assert [look.level for look in rounds.analyses] == [rounds.levels[0], rounds.levels[1], rounds.levels[0]]
-
-
-def test_a_control_that_failed_stops_what_needs_it():
-    world = World()
-    world.failing = {("full", 5)}
-    assert world.to_the_end(start_rounds(SWEEP)).analyses == ()
 
 
 def test_corrections_are_over_all_that_nobody_has_claimed():
@@ -219,28 +191,25 @@ def test_corrections_are_over_all_that_nobody_has_claimed():
     unsure = [f for f in second.findings if f.mode == "stream"]
     assert len(plain) == 6
     assert unsure[0].holm == pytest.approx(min(1, 4 * unsure[0].p))
-    assert all(
-        f.holm == 1 for f in first.findings if f.verdict is Verdict.EQUIVALENT
-    )  # closed to differences
+    equivalent = [f.holm for f in first.findings if f.verdict is Verdict.EQUIVALENT]
+    assert set(equivalent) == {1}  # closed to differences
 
 
-def test_the_table_shows_rounds(tmp_path):
+def test_the_table_shows_rounds():
     world = World()
     rounds = world.to_the_end(start_rounds(SWEEP, 5))
-    table = make_table(rounds.restrict_sweep(SWEEP), world.runs, rounds=rounds)
-    assert {row.label: (len(row.found), len(row.wanted)) for row in table.rows[:4]} == {
-        "full": (5, 5), "worse": (3, 3), "same": (3, 3), "unsure": (5, 5)
-    }  # fmt: skip
+    sweep = rounds.restrict_sweep(SWEEP)
+    table = make_table(sweep, world.runs, rounds=rounds)
+    assert [(len(row.found), len(row.wanted)) for row in table.rows[:4]] == [(5, 5), (3, 3), (3, 3), (5, 5)]
     text = to_markdown(table)
-    assert "higher (3)" in text
-    assert "equivalent (3)" in text
-    assert "analyses at 3 (1.7 %), 5 (3.3 %) seeds" in text
-    assert "p \\< the analysis' level by Holm's correction over the table's 6 comparisons" in text
+    for words in (
+        "higher (3)", "equivalent (3)", "analyses at 3 (1.7 %), 5 (3.3 %) seeds",
+        "p \\< the analysis' level by Holm's correction over the table's 6 comparisons",
+    ):  # fmt: skip
+        assert words in text
     assert "missing" not in text
     del world.runs["unsure"][6]
-    assert "'unsure' seed 6; fill with" in to_markdown(
-        make_table(rounds.restrict_sweep(SWEEP), world.runs, rounds=rounds)
-    )
+    assert "'unsure' seed 6; fill with" in to_markdown(make_table(sweep, world.runs, rounds=rounds))
 
 
 @functools.cache
@@ -249,7 +218,7 @@ def normal(number: int, seed: int, label: str, metric: str) -> float:
     return np.random.default_rng([number, seed, *label.encode(), *metric.encode()]).normal()
 
 
-def false_claims(truth: float, noise: float, times: int = 120) -> float:
+def false_claims(truth: float, noise: float, times: int = 80) -> float:
     """Return the share of sweeps with a false claim.
 
     Differences vary by seed alone, where the p-values are exact, and two clips say as much as more. `truth`

@@ -1,7 +1,5 @@
 """Run folders of invented numbers, a sweep of them, and servers on them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -21,7 +19,6 @@ SEEDS = (0, 1, 2)
 
 @pytest.fixture
 def outputs(tmp_path: Path) -> Path:
-    """An outputs folder with a finished sweep of two variants and three seeds."""
     make_outputs(tmp_path / "outputs")
     return tmp_path / "outputs"
 
@@ -51,7 +48,6 @@ def make_outputs(outputs: Path) -> Sweep:
 
 
 def run_of(outputs: Path, variant: str = "gru", seed: int = 0) -> Run:
-    """Return a run of that sweep."""
     plan = Plan.load(outputs / "sweeps" / "mine" / "plan.json")
     found = plan.run(variant, seed)
     assert found is not None
@@ -83,5 +79,4 @@ def motion(at: int = 300, centimetres: float = 20.0) -> dict[str, np.ndarray]:
 
 
 def predict(run: Run, clip: str, mode: str) -> dict[str, np.ndarray]:
-    """Stand in for a network."""
     return motion(300 if clip == "kicks/01" else 120, 20.0 if run.config["memory"]["name"] == "gru" else 10.0)

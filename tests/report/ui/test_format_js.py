@@ -1,7 +1,5 @@
 """The page's numbers and orders (page/format.js), in node."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The page in a browser: filter, sort, curves, effects, a replay, news, and data that looks like markup."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator
@@ -57,7 +55,6 @@ def browser() -> Iterator[Browser]:
 
 
 def go(browser: Browser, base: str, route: str, until: str) -> None:
-    """Open a route of the page and wait for what it must show."""
     browser.open("about:blank")
     browser.open(f"{base}#/{route}")
     browser.wait(f"!!({READY} && ({until}))")
@@ -66,7 +63,7 @@ def go(browser: Browser, base: str, route: str, until: str) -> None:
 pytestmark = pytest.mark.slow
 
 
-def test_filter_sort_and_the_address(browser: Browser, server: RunsServer):
+def test_filter_sort_compare_and_the_address(browser: Browser, server: RunsServer):
     go(browser, server.url, "runs", "document.querySelectorAll('.runs tbody tr').length >= 9")
     browser.value(
         "const f = document.querySelector('#filter'); f.value = 'memory=gru stream.MPJPE<99'; "
@@ -86,10 +83,6 @@ def test_filter_sort_and_the_address(browser: Browser, server: RunsServer):
     route = browser.value("location.hash")
     go(browser, server.url, route.removeprefix("#/"), f"{NAMES}.length == 3")
     assert browser.value(NAMES) == names[::-1]
-
-
-def test_chosen_runs_are_compared(browser: Browser, server: RunsServer, home: Path):
-    go(browser, server.url, "runs?filter=memory%3Dgru", f"{NAMES}.length == 3")
     browser.click(".runs thead input")
     browser.wait("document.querySelector('a.button').textContent == 'Compare 3'")
     browser.click("a.button")
@@ -108,10 +101,8 @@ def test_a_run_s_page_and_its_replay(browser: Browser, server: RunsServer, home:
         f"document.documentElement.dataset.replayed == '{run.id} 3'",
     )
     assert browser.value("[...document.querySelectorAll('.view-name span')].map(s => s.textContent)") == [
-        "Truth",
-        "memory=gru · seed 0",
-        "memory=none · seed 0",
-    ]
+        "Truth", "memory=gru · seed 0", "memory=none · seed 0",
+    ]  # fmt: skip
     pieces = browser.value("[...document.querySelectorAll('.pieces button')].map(b => b.textContent)")
     assert pieces[0] == "Worst second at 5.0 s: 20.0 cm"
     browser.value("document.querySelector('.transport .primary').click()")
@@ -125,15 +116,24 @@ def test_a_run_s_page_and_its_replay(browser: Browser, server: RunsServer, home:
     assert browser.value("document.querySelectorAll('.meter').length") == 12
 
 
-def test_a_sweep_s_effects_and_curves(browser: Browser, server: RunsServer):
-    go(browser, server.url, "sweep/mine", "document.querySelectorAll('.plot svg').length >= 2")
-    label = browser.value("document.querySelector('.plot svg').ariaLabel")
-    assert label.startswith("MPJPE [cm], differences from the control. gru: \N{MINUS SIGN}")
-    assert ", holds; the paper: \N{MINUS SIGN}1.20" in label
-    assert browser.value("[...document.querySelectorAll('.verdict')].map(v => v.textContent)") == [
-        "holds",
-        "holds",
-    ]
+def test_a_sweep_s_effects_curves_and_rounds(browser: Browser, tmp_path: Path):
+    sweep, folder = make_outputs(tmp_path), tmp_path / "sweeps" / "mine"
+    with RunsServer(Answers(tmp_path, predict), 0) as running:
+        go(browser, running.url, "sweep/mine", "document.querySelectorAll('.plot svg').length >= 2")
+        label = browser.value("document.querySelector('.plot svg').ariaLabel")
+        assert label.startswith("MPJPE [cm], differences from the control. gru: \N{MINUS SIGN}")
+        assert ", holds; the paper: \N{MINUS SIGN}1.20" in label
+        verdicts = "[...document.querySelectorAll('.verdict')].map(v => v.textContent)"
+        assert browser.value(verdicts) == ["holds", "holds"]
+    analyse(sweep, tmp_path, start_rounds(sweep), Plan.load(folder / "plan.json"))
+    with RunsServer(Answers(tmp_path, predict), 0) as running:
+        go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
+        words = browser.value("document.body.textContent")
+        assert "2 of 2 comparisons are decided" in words
+        assert "holdsat 3 seeds" in words
+        rows = browser.value("[...document.querySelectorAll('.pair tbody tr')].map(r => r.textContent)")
+        assert rows[0].startswith("3 seeds")
+        assert "gru203\N{EN DASH}" in rows
 
 
 def scored(run: Run, **values: float) -> None:
@@ -145,9 +145,7 @@ def scored(run: Run, **values: float) -> None:
         write_evaluation(path, report)
 
 
-def test_units_and_directions_of_custom_metrics(
-    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_units_and_directions_of_custom_metrics(browser, tmp_path: Path, monkeypatch):
     """Those of a package in use; of another metric nobody knows what is better."""
     monkeypatch.setitem(UNITS, "Score", "points")
     monkeypatch.setattr("memmlp.report.tables.table_text.HIGHER", {"Score"})
@@ -196,19 +194,6 @@ def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, t
         go(browser, running.url, f"compare?runs={none.id},{gru.id}", f"{NAMES}.length == 2")
         assert browser.value("document.body.textContent.includes('whose errors are not comparable')")
         assert browser.value("document.querySelectorAll('.least').length") == 0
-
-
-def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
-    sweep, folder = make_outputs(tmp_path), tmp_path / "sweeps" / "mine"
-    analyse(sweep, tmp_path, start_rounds(sweep), Plan.load(folder / "plan.json"))
-    with RunsServer(Answers(tmp_path, predict), 0) as running:
-        go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
-        words = browser.value("document.body.textContent")
-        assert "2 of 2 comparisons are decided" in words
-        assert "holdsat 3 seeds" in words
-        rows = browser.value("[...document.querySelectorAll('.pair tbody tr')].map(r => r.textContent)")
-        assert rows[0].startswith("3 seeds")
-        assert "gru203\N{EN DASH}" in rows
 
 
 def test_news_are_shown_without_a_touch(browser: Browser, server: RunsServer, home: Path):

@@ -1,7 +1,5 @@
 """Replays: the worst seconds, the page's axes, and predictions that fail."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from pathlib import Path
@@ -17,7 +15,6 @@ from memmlp.runs.run import Run
 
 
 def ready(replays: Replays, *words: str) -> dict:
-    """Wait for a replay."""
     found: dict = {}
 
     def come() -> bool:
@@ -34,8 +31,7 @@ def test_a_piece_is_around_the_worst_second_in_the_page_s_axes():
     assert found["worst"][0] == {"first": 300, "mean": 20.0}
     assert (found["frames"], found["from"], len(found["truth"])) == (FRAMES, 30, 600)
     assert found["truth"][0][:3] == [0, 1000, 0]  # up is y there
-    assert found["joints"][270][:3] == [200, 1000, 0]
-    assert found["errors"][300] == 20.0
+    assert (found["joints"][270][:3], found["errors"][300]) == ([200, 1000, 0], 20.0)
     assert cut_piece(made["true_positions"], made["predicted_positions"], 12.0)["from"] == 300
 
 

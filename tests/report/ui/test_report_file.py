@@ -1,7 +1,5 @@
 """What `memmlp report` puts into the page's file."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from memmlp.report.ui.report_file import _shorten_run_page, encode_query, round_numbers

@@ -1,7 +1,5 @@
 """The index follows run folders, and shows damage as damage."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -13,20 +11,16 @@ from memmlp.report.ui.run_index import RunIndex, read_facts, read_recent_entries
 
 
 def test_facts_of_a_finished_run(outputs: Path):
+    """Its times are those of the file that was asked for."""
     run = run_of(outputs, "gru", 1)
     (run.folder / "notes.json").write_text(json.dumps({"tags": ["good", 7], "note": "<b>look</b>"}))
     found = read_facts(run.folder)
     assert (found["id"], found["done"], found["steps"], found["damage"]) == (run.id, True, 2000, [])
-    assert found["metrics"]["stream.rotation.MPJPE"] == pytest.approx(
-        run.results["stream"]["rotation"]["MPJPE"]
-    )
+    error = run.results["stream"]["rotation"]["MPJPE"]
+    assert found["metrics"]["stream.rotation.MPJPE"] == pytest.approx(error)
     assert found["metrics"]["latency.median_ms"] == pytest.approx(0.64)
     assert (found["tags"], found["note"]) == (["good", "7"], "<b>look</b>")
     assert found["recent"][-1][0] == 2000
-
-
-def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
-    run = run_of(outputs, "gru", 1)
     path = run.deployment("fp32-0").latency
     record = json.loads(path.read_text())
     changes = {"settings": {"precision": "int8"}, "int8": {"median_ms": 0.32, "onnx_bytes": 7}}
@@ -37,28 +31,19 @@ def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
     assert found["latency.parameters"] == record["parameters"]
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "damaged"),
-    [
-        ("manifest.json", b"{", "manifest.json"),
-        ("config.yaml", b"a: [", "config.yaml"),
-        ("config.yaml", b"\xff\xfe", "config.yaml"),
-        ("config.yaml", b"- a list", "config.yaml"),
-        ("evaluations/stream-0.json", b'{"mean": 3}', "evaluations"),
-        ("notes.json", b"[1]", None),
-        ("metrics.jsonl", b"\x00\x00 no line\n{}\n", None),
-        ("deployments/fp32-0/latency.json", b"[", None),
-        ("FAILED", b"[]", None),
-        (".holder", b'{"pid": "no number", "host": 3}', None),
-    ],
-)
+@pytest.mark.parametrize(("name", "content", "damaged"), [
+    ("manifest.json", b"{", "manifest.json"), ("config.yaml", b"a: [", "config.yaml"),
+    ("config.yaml", b"\xff\xfe", "config.yaml"), ("config.yaml", b"- a list", "config.yaml"),
+    ("evaluations/stream-0.json", b'{"mean": 3}', "evaluations"), ("notes.json", b"[1]", None),
+    ("metrics.jsonl", b"\x00\x00 no line\n{}\n", None), ("deployments/fp32-0/latency.json", b"[", None),
+    ("FAILED", b"[]", None), (".holder", b'{"pid": "no number", "host": 3}', None),
+])  # fmt: skip
 def test_damage_is_listed_and_raises_nothing(outputs: Path, name: str, content: bytes, damaged: str | None):
     run = run_of(outputs)
     (run.folder / name).write_bytes(content)
     index = RunIndex(outputs)
     index.refresh()
-    assert len(index.runs) == 6
-    assert index.runs[run.id]["damage"] == ([damaged] if damaged else [])
+    assert (len(index.runs), index.runs[run.id]["damage"]) == (6, [damaged] if damaged else [])
 
 
 def test_a_folder_without_anything_is_a_run_that_is_damaged(outputs: Path):
@@ -77,8 +62,7 @@ def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.Mo
     )
     index = RunIndex(outputs)
     first = index.refresh()
-    assert index.refresh() == first
-    assert len(parsed) == 6
+    assert (index.refresh(), len(parsed)) == (first, 6)
     run = started_run(outputs)
     second = index.refresh()
     assert (second != first, parsed[6:]) == (True, [run.id])
@@ -93,28 +77,21 @@ def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.Mo
     assert run.id not in index.runs
 
 
-def test_a_run_is_not_done_while_it_is_evaluated(outputs: Path):
-    index = RunIndex(outputs)
-    index.refresh()
-    run = run_of(outputs)
+def test_a_run_is_not_done_while_it_is_evaluated_or_once_its_deployment_failed(outputs: Path):
+    index, run = RunIndex(outputs), run_of(outputs)
+
+    def status() -> str:
+        index.refresh()
+        return index.runs[run.id]["status"]
+
     with run.lock():
         run.attempt("evaluation")
-        index.refresh()
-        assert index.runs[run.id]["status"] == "evaluating"
-    index.refresh()
-    assert index.runs[run.id]["status"] == "done"
-
-
-def test_a_trained_run_whose_deployment_failed_is_not_done(outputs: Path):
-    index = RunIndex(outputs)
-    index.refresh()
-    run = run_of(outputs)
+        assert status() == "evaluating"
+    assert status() == "done"
     run.fail("RuntimeError: ONNX Runtime differs from torch")
-    index.refresh()
-    assert (run.status, index.runs[run.id]["status"]) == ("failed", "failed")
+    assert (run.status, status()) == ("failed", "failed")
     run.retry()
-    index.refresh()
-    assert index.runs[run.id]["status"] == "done"
+    assert status() == "done"
 
 
 def test_last_entries_of_a_log_that_is_being_written(tmp_path: Path):

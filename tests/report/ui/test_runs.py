@@ -1,11 +1,10 @@
 """Rows of runs, units, curves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_logger import an_outdated_evaluation
 from own_package import registers_kept
 from report.ui.conftest import started_run
 
@@ -17,13 +16,7 @@ from memmlp.report.ui.runs import (
     read_curves,
     thin_out,
 )
-from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import (
-    VERSIONS,
-    find_evaluation_versions,
-    hash_evaluation_settings,
-    select_evaluation_settings,
-)
+from memmlp.runs.identity import VERSIONS
 from memmlp.runs.run import Run
 
 
@@ -45,27 +38,21 @@ def test_units_and_what_is_better_of_known_metrics():
         UNITS["Score"] = "points"
         HIGHER.add("Score")
         assert describe_units(metrics) == {
-            "MPJPE": {"unit": "cm", "better": "lower"},
-            "Jitter": {"unit": "10² m/s³", "better": "lower"},
-            "GT Jitter": {"unit": "10² m/s³", "better": ""},
-            "Score": {"unit": "points", "better": "higher"},
+            "MPJPE": {"unit": "cm", "better": "lower"}, "Jitter": {"unit": "10² m/s³", "better": "lower"},
+            "GT Jitter": {"unit": "10² m/s³", "better": ""}, "Score": {"unit": "points", "better": "higher"},
             "median_ms": {"unit": "ms", "better": "lower"},
-        }
+        }  # fmt: skip
     assert "Score" not in describe_units(metrics)
 
 
 def test_modes_of_an_earlier_component_version_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run, settings = Run(tmp_path / ("a" * 16)), select_evaluation_settings({}, "window")
-    report = {
-        "mode": "window",
-        "settings": settings,
-        "component_versions": find_evaluation_versions(settings),
-    }
-    write_report(run.evaluation(hash_evaluation_settings(settings)), {**report, "mean": {}, "clips": []})
+    run = Run(tmp_path / ("a" * 16))
+    an_outdated_evaluation(run)
+    version = VERSIONS["mode.stream"]
+    assert list_outdated_modes(run) == [f"stream (mode.stream 0 -> {version})"]
+    monkeypatch.setitem(VERSIONS, "mode.stream", 0)
     assert list_outdated_modes(run) == []
-    now = VERSIONS["mode.window"]
-    monkeypatch.setitem(VERSIONS, "mode.window", now + 1)
-    assert list_outdated_modes(run) == [f"window (mode.window {now} -> {now + 1})"]
+    monkeypatch.undo()
     run.config_path.write_text("[")
     assert list_outdated_modes(run) == []
 

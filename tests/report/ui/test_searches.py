@@ -1,7 +1,5 @@
 """What the page tells of searches."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from memmlp.report.ui.searches import Searches
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Make the folder of a search among some outputs."""
     folder = tmp_path / "outputs/tune/mine"
     folder.mkdir(parents=True)
     return folder
@@ -49,7 +46,5 @@ def test_of_few_trials_it_says_why_there_is_no_importance(folder: Path):
     write_json(folder / "search.json", asdict(study.search))
     to_the_end(study, folder)
     page = Searches(folder.parents[1]).describe("mine")
-    assert (page["importance"], page["too_few"]) == (
-        [],
-        "needs 25 complete trials; with 2 it would be chance",
-    )
+    assert page["importance"] == []
+    assert page["too_few"].startswith("needs 25 complete trials; with 2")

@@ -1,7 +1,5 @@
 """Sweeps: how far they are, and the same verdicts as `memmlp table`."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +9,7 @@ from fake_runs import fake_run, write_evaluation
 from report.ui.conftest import predict, run_of
 
 from memmlp.cli.sweep import analyse
-from memmlp.report.tables.build_table import (
-    find_finished_runs,
-    make_run_finder,
-    make_state_finder,
-    make_table,
-)
+from memmlp.report.tables import build_table
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.seed_rounds import Rounds, start_rounds
 from memmlp.report.tables.table_text import to_json
@@ -24,7 +17,7 @@ from memmlp.report.ui.run_index import RunIndex
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import DAMAGED_ROUNDS, OTHER_ROUNDS, Sweeps
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import load_sweep_copy, save_sweep_copy
+from memmlp.sweep.definition import Sweep, load_sweep_copy, save_sweep_copy
 from memmlp.sweep.plan import Plan, RunTask
 
 
@@ -37,26 +30,17 @@ def sweeps_of(outputs: Path) -> Sweeps:
 
 
 def describe(sweeps: Sweeps) -> dict:
-    """Return the sweep's page as it is now."""
     sweeps.refresh()
     return sweeps.describe("mine")
 
 
 def test_the_table_is_that_of_the_command(outputs: Path):
-    folder = outputs / "sweeps" / "mine"
-    sweep, plan = load_sweep_copy(folder), Plan.load(folder / "plan.json")
-    assert sweep is not None
-    table = json.loads(
-        to_json(make_table(sweep, find_finished_runs(sweep, make_run_finder(plan, load_measured_run))))
-    )
+    sweep, plan = read_sweep(outputs)
+    runs = build_table.find_finished_runs(sweep, build_table.make_run_finder(plan, load_measured_run))
     shown = describe(sweeps_of(outputs))["table"]
-    assert shown["rows"] == table["rows"]
-    (row,) = [row for row in shown["rows"] if row["label"] == "gru"]
-    effect = row["cells"]["stream"]["MPJPE"]["effect"]
-    assert (effect["verdict"], row["cells"]["stream"]["MPJPE"]["paper_effect"]) == (
-        "holds",
-        pytest.approx(-1.2),
-    )
+    assert shown["rows"] == json.loads(to_json(build_table.make_table(sweep, runs)))["rows"]
+    cell = shown["rows"][1]["cells"]["stream"]["MPJPE"]
+    assert (cell["effect"]["verdict"], cell["paper_effect"]) == ("holds", pytest.approx(-1.2))
 
 
 def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
@@ -79,106 +63,84 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite(outputs: Path):
-    path = outputs / "sweeps" / "mine" / "plan.json"
-    plan = Plan.load(path)
-    prerequisite = fake_run(outputs, "vqvae")
-    first = plan.entries[0]
-    tasks = tuple(
-        replace(task, stages=("stream-absent",)) if task.id == first.id else task for task in plan.tasks
-    )
-    vqvae = RunTask(prerequisite.id, "vqvae", {"vqvae": {"steps": 20}})
-    entries = (replace(first, stages=("stream-absent",)), *plan.entries[1:])
-    replace(plan, entries=entries, tasks=(vqvae, *tasks)).save(path)
-    sweeps = sweeps_of(outputs)
-    found = describe(sweeps)
-    assert (found["counts"], found["prerequisite_counts"], found["tasks"]) == (
-        {"trained": 1, "done": 5},
-        {"done": 1},
-        6,
-    )
-    say = make_state_finder(Plan.load(path))
-    variant = next(
-        variant for variant in load_sweep_copy(path.parent).list_runnable() if variant.label == first.label
-    )
-    assert say(variant, first.seed) == "trained, an evaluation or export is missing"
+    sweep, plan = read_sweep(outputs)
+    first, *entries = plan.entries
+    stages = {"stages": ("stream-absent",)}
+    tasks = [replace(task, **stages) if task.id == first.id else task for task in plan.tasks]
+    vqvae = RunTask(fake_run(outputs, "vqvae").id, "vqvae", {"vqvae": {"steps": 20}})
+    plan = replace(plan, entries=(replace(first, **stages), *entries), tasks=(vqvae, *tasks))
+    plan.save(outputs / "sweeps" / "mine" / "plan.json")
+    found = describe(sweeps_of(outputs))
+    assert (found["counts"], found["prerequisite_counts"]) == ({"trained": 1, "done": 5}, {"done": 1})
+    assert found["tasks"] == 6
+    said = build_table.make_state_finder(plan)(sweep.list_runnable()[0], first.seed)
+    assert said == "trained, an evaluation or export is missing"
 
 
 def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
     run = run_of(outputs, "gru", 2)
     with run.lock():
         run.attempt("evaluation")
-        sweeps = sweeps_of(outputs)
-        found = describe(sweeps)
+        found = describe(sweeps_of(outputs))
     assert (found["counts"], found["remaining"]) == ({"done": 5, "evaluating": 1}, None)
     assert 0.999 < found["share"] < 1
 
 
 def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
-    folder, run = outputs / "sweeps" / "mine", run_of(outputs, "gru", 0)
-    sweep = load_sweep_copy(folder)
-    assert sweep is not None
-    save_sweep_copy(replace(sweep, metrics=("FLOPs", "MPJRE", "MPJPE")).with_branch("combined"), folder)
-    page = describe(sweeps_of(outputs))
-    assert (page["metric"], page["branch"]) == ("MPJRE", "combined")
+    """A sweep with another control has another table, though the runs stay as they are."""
+    folder, run, sweeps = outputs / "sweeps" / "mine", run_of(outputs, "gru", 0), sweeps_of(outputs)
+    sweep, _ = read_sweep(outputs)
+    assert describe(sweeps)["table"]["control"] == "none"
+    before = sweeps.refresh()
+    other = replace(sweep, control="gru", metrics=("FLOPs", "MPJRE", "MPJPE"))
+    save_sweep_copy(other.with_branch("combined"), folder)
+    page = describe(sweeps)
+    assert (page["metric"], page["branch"], page["table"]["control"]) == ("MPJRE", "combined", "gru")
     (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
     assert cell["value"] == pytest.approx(run.results["stream"]["combined"]["MPJRE"])
+    assert sweeps.refresh() != before
 
 
 def test_variants_of_one_training_have_each_the_value_of_their_own_evaluation(outputs: Path):
     """A network may be used in another way, such as with another estimate of its past."""
-    run = run_of(outputs, "gru", 0)
+    run, path = run_of(outputs, "gru", 0), outputs / "sweeps" / "mine" / "plan.json"
     report = json.loads(run.evaluation("stream-0").read_text())
-    own = report["mean"]["rotation"]["MPJPE"]
     report["mean"]["rotation"]["MPJPE"] += 7.0
     report["settings"] = {"memory.blend": 0.25}  # is no evaluation of the run's own config
     write_evaluation(run.evaluation("stream-1"), report)
-    path = outputs / "sweeps" / "mine" / "plan.json"
     plan = json.loads(path.read_text())
     for planned in (*plan["entries"], *plan["tasks"]):
         if planned["id"] == run.id:
             planned["stages"] = ["stream-1"]
     path.write_text(json.dumps(plan))
-    page = describe(sweeps_of(outputs))
-    (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
-    assert cell["value"] == pytest.approx(own + 7.0)
-
-
-def test_a_sweep_with_another_control_has_another_table(outputs: Path):
-    """The runs stay as they are: a variant's control, metrics and margins are the sweep's own."""
-    folder = outputs / "sweeps" / "mine"
-    sweeps, sweep = sweeps_of(outputs), load_sweep_copy(folder)
-    assert sweep is not None
-    assert describe(sweeps)["table"]["control"] == "none"
-    before = sweeps.refresh()
-    save_sweep_copy(replace(sweep, control="gru", metrics=("MPJRE",)), folder)
-    table = describe(sweeps)["table"]
-    assert (table["control"], table["metrics"]) == ("gru", ["MPJRE"])
-    assert sweeps.refresh() != before
+    (cell,) = [cell for cell in describe(sweeps_of(outputs))["cells"] if cell["id"] == run.id]
+    assert cell["value"] == pytest.approx(report["mean"]["rotation"]["MPJPE"])
 
 
 def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
     """Most of the paper's tables have a control that does not stand first."""
-    folder, answers = outputs / "sweeps" / "mine", Answers(outputs, predict, 0.0)
-    sweep = load_sweep_copy(folder)
-    assert sweep is not None
+    answers = Answers(outputs, predict, 0.0)
 
-    def control(variant: str) -> dict | None:
+    def control(variant: str) -> str | None:
         answers.next_look = 0.0
-        return answers.answer(f"run/{run_of(outputs, variant, 1).id}", {})["control"]
+        found = answers.answer(f"run/{run_of(outputs, variant, 1).id}", {})["control"]
+        return found and found["id"]
 
-    assert control("none") is None
-    assert control("gru")["id"] == run_of(outputs, "none", 1).id
-    save_sweep_copy(replace(sweep, control="gru"), folder)
-    assert control("gru") is None
-    assert control("none")["id"] == run_of(outputs, "gru", 1).id
+    assert (control("none"), control("gru")) == (None, run_of(outputs, "none", 1).id)
+    save_sweep_copy(replace(read_sweep(outputs)[0], control="gru"), outputs / "sweeps" / "mine")
+    assert (control("none"), control("gru")) == (run_of(outputs, "gru", 1).id, None)
 
 
-def looked(outputs: Path) -> Rounds:
-    """Take the first look, at the three seeds that there are."""
+def read_sweep(outputs: Path) -> tuple[Sweep, Plan]:
     folder = outputs / "sweeps" / "mine"
     sweep = load_sweep_copy(folder)
     assert sweep is not None
-    return analyse(sweep, outputs, start_rounds(sweep), Plan.load(folder / "plan.json"))
+    return sweep, Plan.load(folder / "plan.json")
+
+
+def looked(outputs: Path) -> Rounds:
+    sweep, plan = read_sweep(outputs)
+    return analyse(sweep, outputs, start_rounds(sweep), plan)
 
 
 def test_verdicts_of_rounds_and_their_analyses_are_shown(outputs: Path):
@@ -198,17 +160,11 @@ def test_verdicts_of_rounds_and_their_analyses_are_shown(outputs: Path):
     assert variants["gru"] == {"label": "gru", "decided": 2, "inconclusive": 0, "seeds": 3, "next": None}
 
 
-@pytest.mark.parametrize(
-    ("change", "flag"),
-    [
-        ({"subject": {}}, OTHER_ROUNDS),
-        ({"analyses": 3}, DAMAGED_ROUNDS),
-        (
-            {"analyses": [{"seeds": 3, "level": 0.1, "runs": {"gru": "0"}, "findings": []}]},
-            DAMAGED_ROUNDS,
-        ),
-    ],
-)
+@pytest.mark.parametrize(("change", "flag"), [
+    ({"subject": {}}, OTHER_ROUNDS),
+    ({"analyses": 3}, DAMAGED_ROUNDS),
+    ({"analyses": [{"seeds": 3, "level": 0.1, "runs": {"gru": "0"}, "findings": []}]}, DAMAGED_ROUNDS),
+])  # fmt: skip
 def test_rounds_of_something_else_are_flagged(outputs: Path, change: dict, flag: str):
     looked(outputs)
     path = outputs / "sweeps" / "mine" / "rounds.json"

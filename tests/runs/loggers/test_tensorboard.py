@@ -1,7 +1,5 @@
 """TensorBoard's event files have what the run folder has, read back as TensorBoard reads them."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

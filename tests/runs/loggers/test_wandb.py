@@ -1,7 +1,5 @@
 """W&B's own client writes offline runs that have what the run folder has; read back with its own reader."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Iterator
@@ -59,7 +57,6 @@ def pieces(content: bytes) -> Iterator[bytes]:
 
 
 def curve(found: list[Any], key: str) -> list[tuple[float, float]]:
-    """A curve's values, and the numbers of their rows."""
     history = [
         {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
         for record in found
@@ -69,7 +66,6 @@ def curve(found: list[Any], key: str) -> list[tuple[float, float]]:
 
 
 def summary(found: list[Any]) -> dict[str, Any]:
-    """A run's summary."""
     return {
         item.key or "/".join(item.nested_key): json.loads(item.value_json)
         for record in found

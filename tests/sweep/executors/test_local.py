@@ -1,7 +1,5 @@
 """Workers that are processes of this machine: they work, end, and see their own GPUs."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -18,12 +16,8 @@ from processes import ignoring_interrupts, until
 from memmlp.sweep.executors.local import DebugExecutor, LocalExecutor, list_visible_gpus
 
 
-def touch(path: str) -> None:
-    Path(path).touch()
-
-
 def test_a_debug_worker_works_in_this_process(tmp_path: Path):
-    (handle,) = DebugExecutor().submit(partial(touch, str(tmp_path / "done")))
+    (handle,) = DebugExecutor().submit((tmp_path / "done").touch)
     assert not handle.alive()  # it works when it is asked
     assert (tmp_path / "done").exists()
     assert handle.complaint() is None
@@ -34,7 +28,7 @@ def test_a_worker_imports_the_package_that_starts_it(tmp_path: Path, monkeypatch
     (tmp_path / "memmlp").mkdir()
     (tmp_path / "memmlp" / "__init__.py").write_text("")
     monkeypatch.chdir(tmp_path)
-    (handle,) = LocalExecutor(tmp_path / "%j").submit(partial(touch, str(tmp_path / "done")))
+    (handle,) = LocalExecutor(tmp_path / "%j").submit((tmp_path / "done").touch)
     until(lambda: not handle.alive(), "the worker ends")
     assert (tmp_path / "done").exists()
 

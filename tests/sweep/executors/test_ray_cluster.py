@@ -1,7 +1,5 @@
 """Ray: its options, and where it is installed a cluster on this machine with two GPUs that it is told of."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal
@@ -36,16 +34,13 @@ def test_options(tmp_path: Path):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        ({"gpus": "1"}, "ray.gpus: no such key; expected one of address"),
-        ({"num_gpus": "-1"}, "ray.num_gpus=-1: must be a number"),
-        ({"resources.x": "much"}, "ray.resources.x=much: must be a number"),
-        ({"runtime_env": "/none.yaml"}, "ray.runtime_env=/none.yaml: no such file"),
-        ({"runtime_env": __file__}, "ray.runtime_env"),
-    ],
-)
+@pytest.mark.parametrize(("words", "line"), [
+    ({"gpus": "1"}, "ray.gpus: no such key; expected one of address"),
+    ({"num_gpus": "-1"}, "ray.num_gpus=-1: must be a number"),
+    ({"resources.x": "much"}, "ray.resources.x=much: must be a number"),
+    ({"runtime_env": "/none.yaml"}, "ray.runtime_env=/none.yaml: no such file"),
+    ({"runtime_env": __file__}, "ray.runtime_env"),
+])  # fmt: skip
 def test_bad_options_are_one_line(words: dict[str, str], line: str):
     with pytest.raises(InputError, match=line) as error:
         parse(words)

@@ -1,7 +1,5 @@
 """Slurm by its sbatch file, and by a stand-in for its commands."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The board of a search."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

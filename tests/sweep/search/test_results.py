@@ -1,27 +1,15 @@
 """What a search leaves: trials as CSV, experiments, Table 5, plots."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import fake_search
 import numpy as np
 import optuna
 import pytest
 import yaml
-from fake_search import (
-    STEPS,
-    begun,
-    director,
-    error,
-    finish,
-    log,
-    open_study,
-    seeded,
-    to_the_end,
-    with_a_pruned_trial,
-)
 from optuna.distributions import FloatDistribution
 from optuna.trial import create_trial
 
@@ -30,21 +18,23 @@ from memmlp.sweep.search.search_file import Range
 from memmlp.sweep.search.study import Study, suggest_value
 
 
+def read_rows(study: Study, folder: Path) -> list[dict[str, str]]:
+    results.write_trials(study, folder / "trials.csv")
+    with open(folder / "trials.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def test_trials_of_several_seeds_as_csv(tmp_path: Path):
-    study = open_study(tmp_path, seeds=2, n_trials=2, objectives=["MPJPE", "Jitter"])
-    one = seeded(study, tmp_path)
-    finish(one.update(1))
-    finish(one.update(1))
-    begun(one.update(1)).fail("the loss is nan")
+    study = fake_search.open_study(tmp_path, seeds=2, n_trials=2, objectives=["MPJPE", "Jitter"])
+    one = fake_search.seeded(study, tmp_path)
+    fake_search.finish(one.update(1))
+    fake_search.finish(one.update(1))
+    fake_search.begun(one.update(1)).fail("the loss is nan")
     one.update(1)
-    results.write_trials(study, tmp_path / "trials.csv")
-    with open(tmp_path / "trials.csv", newline="") as file:
-        row, failed = csv.DictReader(file)
-    first = error({"values": study.trials[0].params, "seed": 0})
-    assert float(row["MPJPE"]) == pytest.approx(first + 0.15)
-    assert float(row["MPJPE sd"]) == pytest.approx(0.3 / 2**0.5)
-    assert float(row["MPJPE, run 1"]) == pytest.approx(first)
-    assert float(row["Jitter, run 2"]) == pytest.approx(20 - first - 0.3)
+    row, failed = read_rows(study, tmp_path)
+    first = fake_search.error({"values": study.trials[0].params, "seed": 0})
+    found = [float(row[key]) for key in ("MPJPE", "MPJPE sd", "MPJPE, run 1", "Jitter, run 2")]
+    assert found == pytest.approx([first + 0.15, 0.3 / 2**0.5, first, 20 - first - 0.3])
     assert len(row["run"].split()) == 2
     assert (failed["state"], failed["MPJPE sd"], failed["reason"]) == ("fail", "", "the loss is nan")
     (path,) = results.write_experiments(study, tmp_path, ["loss"])
@@ -53,20 +43,19 @@ def test_trials_of_several_seeds_as_csv(tmp_path: Path):
 
 def test_a_pruned_trial_has_no_value_in_the_csv(tmp_path: Path):
     """Optuna gives it that of its last step, which is none of a trained network."""
-    study = with_a_pruned_trial(tmp_path)
-    results.write_trials(study, tmp_path / "trials.csv")
-    with open(tmp_path / "trials.csv", newline="") as file:
-        first, second, _ = csv.DictReader(file)
+    first, second, _ = read_rows(fake_search.with_a_pruned_trial(tmp_path), tmp_path)
     assert (first["state"], first["MPJPE"], first["reason"]) == ("complete", "5.0", "")
     assert (second["state"], second["MPJPE"], second["reason"]) == ("pruned", "", "9 at step 10")
 
 
 def test_a_trial_that_is_no_longer_of_the_front_has_no_file(tmp_path: Path):
-    study = open_study(tmp_path, objectives=["MPJPE", "Jitter"], n_trials=3)
-    one = director(study, tmp_path)
+    study = fake_search.open_study(tmp_path, objectives=["MPJPE", "Jitter"], n_trials=3)
+    one = fake_search.director(study, tmp_path)
     for errors in ((1.0, 3.0), (3.0, 1.0), (0.5, 0.5)):
-        run = begun(one.update(1))
-        run.log(STEPS, dict(zip(("rotation MPJPE", "rotation Jitter"), errors, strict=True)), "val")
+        run = fake_search.begun(one.update(1))
+        run.log(
+            fake_search.STEPS, dict(zip(("rotation MPJPE", "rotation Jitter"), errors, strict=True)), "val"
+        )
         run.finish([])
         one.update(0)
         results.write_experiments(study, tmp_path, ["loss"])
@@ -75,8 +64,8 @@ def test_a_trial_that_is_no_longer_of_the_front_has_no_file(tmp_path: Path):
 
 @pytest.mark.slow
 def test_two_objectives_give_a_front(tmp_path: Path):
-    study = open_study(tmp_path, objectives=["MPJPE", "Jitter"])
-    to_the_end(study, tmp_path)
+    study = fake_search.open_study(tmp_path, objectives=["MPJPE", "Jitter"])
+    fake_search.to_the_end(study, tmp_path)
     front = study.list_best()
     assert len(front) == 6  # Jitter is 20 less MPJPE here, so that none is better in both
     assert [trial.values[0] for trial in front] == sorted(trial.values[0] for trial in front)
@@ -87,11 +76,9 @@ def test_two_objectives_give_a_front(tmp_path: Path):
 
 @pytest.mark.slow
 def test_what_a_search_leaves(tmp_path: Path):
-    study = open_study(tmp_path)
-    to_the_end(study, tmp_path)
-    results.write_trials(study, tmp_path / "trials.csv")
-    with open(tmp_path / "trials.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    study = fake_search.open_study(tmp_path)
+    fake_search.to_the_end(study, tmp_path)
+    rows = read_rows(study, tmp_path)
     assert [row["trial"] for row in rows] == list("012345")
     assert [float(row["MPJPE"]) for row in rows] == [trial.value for trial in study.trials]
     (path,) = results.write_experiments(study, tmp_path, ["loss"])
@@ -106,23 +93,20 @@ def test_what_a_search_leaves(tmp_path: Path):
     assert "<script src=" not in page
 
 
-def after_one_trial(folder: Path, space: dict, base: list[str]) -> Study:
-    """A study whose one trial is complete."""
-    study = open_study(folder, space=space, n_trials=1, base=base)
-    one = director(study, folder)
-    run = begun(one.update(1))
-    log(run, STEPS, 1.0)
+def write_best(folder: Path, space: dict, base: list[str], *groups: str) -> dict[str, Any]:
+    study = fake_search.open_study(folder, space=space, n_trials=1, base=base)
+    one = fake_search.director(study, folder)
+    run = fake_search.begun(one.update(1))
+    fake_search.log(run, fake_search.STEPS, 1.0)
     run.finish([])
     one.update(1)
-    return study
+    (path,) = results.write_experiments(study, folder, groups)
+    return yaml.safe_load(path.read_text())
 
 
 def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path):
     space = {"hand": {"choices": ["off", "fk"]}, "memory": {"layers": {"choices": [[2], [2, 4]]}}}
-    space |= {"seed": {"low": 3, "high": 9}}
-    study = after_one_trial(tmp_path, space, [])
-    (path,) = results.write_experiments(study, tmp_path, ["hand", "memory"])
-    content = yaml.safe_load(path.read_text())
+    content = write_best(tmp_path, space | {"seed": {"low": 3, "high": 9}}, [], "hand", "memory")
     assert content["defaults"][0]["override /hand"] in ("off", "fk")
     assert content["memory"]["layers"] in ([2], [2, 4])
     assert content["seed"] in range(3, 10)
@@ -130,45 +114,36 @@ def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path)
 
 def test_of_a_key_in_the_base_and_the_trial_the_trials_value_is_written(tmp_path: Path):
     """And no experiment, since none can choose another."""
-    space = {"hand": {"choices": ["fk", "position"]}}
-    study = after_one_trial(tmp_path, space, ["hand=off", "experiment=manual_weights"])
-    (path,) = results.write_experiments(study, tmp_path, ["hand", "experiment"])
-    (hand, itself) = yaml.safe_load(path.read_text())["defaults"]
+    space, base = {"hand": {"choices": ["fk", "position"]}}, ["hand=off", "experiment=manual_weights"]
+    hand, itself = write_best(tmp_path, space, base, "hand", "experiment")["defaults"]
     assert (hand["override /hand"] in ("fk", "position"), itself) == (True, "_self_")
 
 
-@pytest.mark.parametrize(
-    ("tried", "values", "said"),
-    [
-        ({"choices": [0.001, 0.002, 0.008]}, [0.001, 0.002, 0.008], "0.008, is the largest"),
-        ({"choices": [0.001, 0.002, 0.008, 0.016]}, [0.001, 0.002, 0.016, 0.008], None),
-        ({"choices": [0.008, 0.016, 0.004]}, [0.016, 0.008, 0.004], "0.004, is the smallest"),
-        ({"choices": [0.0, 0.1, 0.2]}, [0.2, 0.1, 0.0], None),  # nothing lies beyond zero
-        ({"choices": [False, True]}, [True, False], None),
-        ({"choices": ["a", "b", 3]}, ["a", "b", 3], None),
-        ({"low": 1e-4, "high": 1e-2, "log": True}, [1e-3, 9.5e-3], "0.0095, is the largest"),
-        ({"low": 1e-4, "high": 1e-2, "log": True}, [9.5e-3, 5e-3], None),
-        ({"low": 1e-4, "high": 1e-2}, [9.5e-3, 2.9e-4], "0.00029, is the smallest"),
-        ({"low": 2, "high": 6}, [4, 2, 6], "6, is the largest"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("tried", "values", "said"), [
+    ({"choices": (0.001, 0.002, 0.008)}, [0.001, 0.002, 0.008], "0.008, is the largest"),
+    ({"choices": (0.001, 0.002, 0.008, 0.016)}, [0.001, 0.002, 0.016, 0.008], None),
+    ({"choices": (0.008, 0.016, 0.004)}, [0.016, 0.008, 0.004], "0.004, is the smallest"),
+    ({"choices": (0.0, 0.1, 0.2)}, [0.2, 0.1, 0.0], None),  # nothing lies beyond zero
+    ({"choices": (False, True)}, [True, False], None),
+    ({"choices": ("a", "b", 3)}, ["a", "b", 3], None),
+    ({"low": 1e-4, "high": 1e-2, "log": True}, [1e-3, 9.5e-3], "0.0095, is the largest"),
+    ({"low": 1e-4, "high": 1e-2, "log": True}, [9.5e-3, 5e-3], None),
+    ({"low": 1e-4, "high": 1e-2}, [9.5e-3, 2.9e-4], "0.00029, is the smallest"),
+    ({"low": 2, "high": 6}, [4, 2, 6], "6, is the largest"),
+])  # fmt: skip
 def test_a_best_value_boundary_warnings_of_what_was_tried_is_told(tried, values, said):
     """The last value is the best: so is a network tuned that is not, and looks it."""
     study = optuna.create_study()
     for number, value in enumerate(values):
         study.enqueue_trial({"optim.lr": value})
         trial = study.ask()
-        suggest_value(
-            trial, Range("optim.lr", **{k: tuple(v) if k == "choices" else v for k, v in tried.items()})
-        )
+        suggest_value(trial, Range("optim.lr", **tried))
         study.tell(trial, -number)
     found = results.find_boundary_warnings(study)
     assert [line.startswith(f"optim.lr: the best value, {said}") for line in found] == [True] * bool(said)
 
 
-def add_random_trials(
-    study: optuna.Study, number: int, names: Sequence[str] = ("acts", "inert", "also inert")
-):
+def add_random_trials(study, number: int, names: Sequence[str] = ("acts", "inert", "also inert")):
     """Add complete trials of random values, of which the first alone decides."""
     between = dict.fromkeys(names, FloatDistribution(0.0, 1.0))
     for values in np.random.default_rng(0).random((number, len(names))):
@@ -176,18 +151,13 @@ def add_random_trials(
         study.add_trial(create_trial(params=params, distributions=between, value=(values[0] - 0.5) ** 2))
 
 
-def test_few_trials_have_no_importance():
-    """It would be chance: an inert key ranks first in most random searches of ten trials."""
+def test_importance_needs_trials_and_is_of_the_key_that_acts():
+    """Of few it would be chance: an inert key ranks first in most random searches of ten trials."""
     study = optuna.create_study()
     assert results.explain_missing_importances(study) is None
     add_random_trials(study, 24)
     assert results.compute_importances(study) == []
-    assert (
-        results.explain_missing_importances(study) == "needs 25 complete trials; with 24 it would be chance"
-    )
-
-
-def test_of_enough_trials_the_key_that_acts_is_the_most_important():
+    assert results.explain_missing_importances(study).startswith("needs 25 complete trials; with 24")
     study = optuna.create_study()
     add_random_trials(study, results.ENOUGH_TRIALS)
     (first, share), *rest = results.compute_importances(study)

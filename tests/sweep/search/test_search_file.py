@@ -1,7 +1,5 @@
 """Searches from configs: what is refused, and what objectives and ranges mean."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -10,21 +8,11 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.search.search_file import Range, parse_search
 
 GOOD: dict[str, Any] = {
-    "name": "mine",
-    "base": ["loss=manual"],
+    "name": "mine", "base": ["loss=manual"],
     "space": {"loss": {"rotation_all": {"low": 0.1, "high": 10.0, "log": True, "first": 1.0}}},
-    "objectives": ["MPJPE"],
-    "n_trials": 3,
-    "seeds": 1,
-    "sampler": "tpe",
-    "startup": 2,
-    "seed": 0,
-    "pruner": "median",
-    "prune_after": 2,
-    "tflop": None,
-    "after": None,
-    "storage": None,
-}
+    "objectives": ["MPJPE"], "n_trials": 3, "seeds": 1, "sampler": "tpe", "startup": 2, "seed": 0,
+    "pruner": "median", "prune_after": 2, "tflop": None, "after": None, "storage": None,
+}  # fmt: skip
 
 
 def made(**changes: Any):
@@ -39,25 +27,15 @@ def test_a_tree_of_keys_becomes_ranges():
     found = made(
         space={"loss": {"hand": {"low": 0.1, "high": 1.0}}, "hand": {"choices": ["off", "fk"], "first": "fk"}}
     )
-    assert found.space == (
-        Range("loss.hand", 0.1, 1.0),
-        Range("hand", choices=("off", "fk"), first="fk"),
-    )
+    assert found.space == (Range("loss.hand", 0.1, 1.0), Range("hand", choices=("off", "fk"), first="fk"))
     assert found.list_first_trials() == [{"hand": "fk"}]
     assert found.space[1].list_corners() == ("off", "fk")
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("MPJPE", 6.0),
-        ("rotation MPJPE", 6.0),
-        ("position MPJPE", 5.0),
-        ("MPJPE + 0.1*Jitter", 7.0),
-        ("0.5 * MPJPE + 2*position Hand PE", 5.0),
-        ("1e-1*Hand PE", 0.2),
-    ],
-)
+@pytest.mark.parametrize(("text", "value"), [
+    ("MPJPE", 6.0), ("rotation MPJPE", 6.0), ("position MPJPE", 5.0), ("MPJPE + 0.1*Jitter", 7.0),
+    ("0.5 * MPJPE + 2*position Hand PE", 5.0), ("1e-1*Hand PE", 0.2),
+])  # fmt: skip
 def test_an_objective_is_a_weighted_sum(text: str, value: float):
     metrics = {
         "rotation MPJPE": 6.0, "rotation Jitter": 10.0, "rotation Hand PE": 2.0,
@@ -72,8 +50,7 @@ def test_an_objective_that_is_not_validated_is_named():
 
 
 WRONG: list[tuple[dict[str, Any], str]] = [
-    ({"space": {}}, "search.space: empty"),
-    ({"space": {"loss": 3}}, "search.space.loss: 3"),
+    ({"space": {}}, "search.space: empty"), ({"space": {"loss": 3}}, "search.space.loss: 3"),
     ({"space": space(low=1.0)}, "search.space.optim.lr.high: nothing"),
     ({"space": space(low=2.0, high=1.0)}, "optim.lr.high=1.0"),
     ({"space": space(low=0.0, high=1.0, log=True)}, "optim.lr.low=0.0"),
@@ -82,8 +59,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"space": space(low=True, high=2.0)}, "optim.lr.low: True"),
     ({"space": space(low=1.0, high=2.0, first=3.0)}, "optim.lr.first=3.0"),
     ({"space": space(low=1.0, high=2.0, hihg=3.0)}, "optim.lr.hihg: no such key"),
-    ({"space": space(choices="ab")}, "optim.lr.choices"),
-    ({"space": space(choices=[1])}, "optim.lr.choices"),
+    ({"space": space(choices="ab")}, "optim.lr.choices"), ({"space": space(choices=[1])}, "optim.lr.choices"),
     ({"space": space(choices=[1, 1])}, "optim.lr.choices"),
     ({"space": space(choices=[1, 2], low=1)}, "optim.lr.low"),
     ({"space": space(low=1.0, high=2.0, log="maybe")}, "optim.lr.log=maybe"),
@@ -94,35 +70,24 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"objectives": []}, "search.objectives"),
     ({"objectives": ["MPJPE", "MPJRE", "MPJVE"], "pruner": "none"}, "search.objectives"),
     ({"objectives": ["MPJPE", "MPJPE"], "pruner": "none"}, "search.objectives"),
-    ({"objectives": ["MPJPE", "Jitter"]}, "search.pruner=median"),
-    ({"objectives": ["Jitters"]}, "'Jitters'"),
+    ({"objectives": ["MPJPE", "Jitter"]}, "search.pruner=median"), ({"objectives": ["Jitters"]}, "'Jitters'"),
     ({"objectives": ["MPJPE - Jitter"]}, "'MPJPE - Jitter'"),
-    ({"objectives": ["head MPJPE"]}, "'head MPJPE'"),
-    ({"objectives": ["1e*MPJPE"]}, "'1e*MPJPE'"),
-    ({"objectives": ["0*MPJPE"]}, "above 0"),
-    ({"objectives": ["1e999*MPJPE"]}, "above 0"),
-    ({"objectives": "MPJPE"}, "search.objectives=MPJPE"),
-    ({"base": [1]}, "search.base="),
-    ({"n_trials": 0}, "search.n_trials=0"),
-    ({"n_trials": True}, "search.n_trials=True"),
+    ({"objectives": ["head MPJPE"]}, "'head MPJPE'"), ({"objectives": ["1e*MPJPE"]}, "'1e*MPJPE'"),
+    ({"objectives": ["0*MPJPE"]}, "above 0"), ({"objectives": ["1e999*MPJPE"]}, "above 0"),
+    ({"objectives": "MPJPE"}, "search.objectives=MPJPE"), ({"base": [1]}, "search.base="),
+    ({"n_trials": 0}, "search.n_trials=0"), ({"n_trials": True}, "search.n_trials=True"),
     ({"seeds": 0}, "search.seeds=0"),
     ({"seeds": 3, "space": {"seed": {"low": 0, "high": 9}}}, "search.seeds=3"),
-    ({"startup": 1.5}, "search.startup=1.5"),
-    ({"startup": None}, "search.startup=None"),
-    ({"prune_after": None}, "search.prune_after=None"),
-    ({"prune_after": 0}, "search.prune_after=0"),
-    ({"seed": -1}, "search.seed=-1"),
-    ({"sampler": "gp"}, "search.sampler=gp"),
+    ({"startup": 1.5}, "search.startup=1.5"), ({"startup": None}, "search.startup=None"),
+    ({"prune_after": None}, "search.prune_after=None"), ({"prune_after": 0}, "search.prune_after=0"),
+    ({"seed": -1}, "search.seed=-1"), ({"sampler": "gp"}, "search.sampler=gp"),
     ({"sampler": "grid"}, "search.space.loss.rotation_all"),
     ({"sampler": "grid", "space": space(choices=[1, 2], first=1)}, "optim.lr"),
     ({"sampler": "grid", "space": space(choices=[1, 2, 3]), "n_trials": 2}, "search.n_trials=2: must be 3"),
-    ({"pruner": "hyperband"}, "search.pruner=hyperband"),
-    ({"name": "a/b"}, "search.name=a/b"),
-    ({"name": "a" * 65}, "search.name="),
-    ({"tflop": 0}, "search.tflop=0"),
-    ({"storage": 5}, "search.storage=5"),
-    ({"nonsense": 3}, "search.nonsense: no such key"),
-]
+    ({"pruner": "hyperband"}, "search.pruner=hyperband"), ({"name": "a/b"}, "search.name=a/b"),
+    ({"name": "a" * 65}, "search.name="), ({"storage": 5}, "search.storage=5"),
+    ({"tflop": 0}, "search.tflop=0"), ({"nonsense": 3}, "search.nonsense: no such key"),
+]  # fmt: skip
 
 
 def test_what_is_wrong_is_named():

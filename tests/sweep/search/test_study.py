@@ -1,19 +1,11 @@
 """The study survives kills, proposes the same again, and says what it cannot read."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_search import (
-    director,
-    finish,
-    open_study,
-    search,
-    to_the_end,
-)
+from fake_search import director, finish, open_study, search, to_the_end
 from machines import fenced
 
 from memmlp.common.errors import InputError, LeaseLost
@@ -21,9 +13,10 @@ from memmlp.sweep.search.study import Study, journal_path, repair_journal
 
 
 def test_a_resumed_search_proposes_what_the_undisturbed_one_does(tmp_path: Path):
-    calm = open_study(tmp_path / "calm" if (tmp_path / "calm").mkdir() is None else tmp_path)
+    for name in ("calm", "stopped"):
+        (tmp_path / name).mkdir()
+    calm = open_study(tmp_path / "calm")
     to_the_end(calm, tmp_path / "calm", capacity=1)
-    (tmp_path / "stopped").mkdir()
     for _ in range(6):
         one = director(open_study(tmp_path / "stopped"), tmp_path / "stopped")
         finish(one.update(1))
