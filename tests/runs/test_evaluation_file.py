@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from begun_runs import begun
+from fake_runs import write_evaluation
 
 import memmlp.runs.identity
 from memmlp.common.errors import InputError
@@ -22,7 +23,7 @@ def solved(run: Run, ik: str, value: float, iterations: int | None = None, made:
     clips = [{"name": "a", "frames": 60, **errors}]
     report = {"mode": "stream", "settings": settings, "mean": errors, "clips": clips, "made": made}
     run.evaluations.mkdir(exist_ok=True)
-    write_json(run.evaluation(hash_evaluation_settings(settings)), report)
+    write_evaluation(run.evaluation(hash_evaluation_settings(settings)), report)
 
 
 def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
