@@ -16,12 +16,15 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import HEAD, JOINTS, PARENTS, make_builtin_rest_joints
+from memmlp.motion.body import FPS, HEAD, JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.clip import PIECE, Clip, find_nearest_rate, is_known_rate
+from memmlp.motion.dynamics import MOST_FRAMES, find_dynamic_faults
 
-ANKLES, KNEES, ELBOWS = (
-    [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")] for joint in ("ankle", "knee", "elbow")
+ANKLES, KNEES, ELBOWS, HIPS, TOES = (
+    [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")]
+    for joint in ("ankle", "knee", "elbow", "hip", "foot")
 )
+SPINE = JOINTS.index("spine1")
 LEGS = [JOINTS.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("hip", "knee")]
 MOST_TURN = 4 * math.pi  # pi would suffice for rotation vectors; fitted ones reach 2 pi and more
 MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
@@ -30,6 +33,7 @@ LOWEST = 0.3  # metres from the lowest joint to z = 0; farther away, sliding fee
 RATES = (20.0, 500.0)  # Hz: range of usual rates; others may be mistakes, such as 12 instead of 120
 STIFF = 0.01  # radians: maximum range of a joint that counts as not turning
 BACKWARDS = 0.3  # radians: a larger bend in the wrong direction is a fault; stretched limbs reach 0.08
+BACKWARD_FEET = 0.5  # cosine of feet and pelvis; recorded motion reaches -0.2
 SAMPLES = 50  # maximum number of frames for posture checks
 JUMP = 8.0  # ratio to surrounding steps; recorded motion reaches 5, cuts or jumps by 1 m exceed 13
 AROUND, SLOWEST = 9, 0.3  # window, frames; m/s added to the median step, because resting bodies tremble
@@ -89,7 +93,18 @@ def find_faults(clip: Clip) -> Iterator[str]:
     if abs(lowest) > LOWEST and not _has_resting_joint(clip):
         where = f"the lowest joint is at z = {lowest:.1f} m, and no joint stands still while the pelvis moves"
         yield f"{where}, so trans may not be in metres with Z up, or may lack the heights"
+    forward = np.cross(joints[:, HIPS[0]] - joints[:, HIPS[1]], joints[:, SPINE] - joints[:, 0])
+    feet = joints[:, TOES].mean(1) - joints[:, ANKLES].mean(1)
+    if (
+        np.median((feet * forward).sum(-1) / np.linalg.norm(feet, axis=-1) / np.linalg.norm(forward, axis=-1))
+        < -BACKWARD_FEET
+    ):
+        yield "the feet point backward relative to the pelvis, so left and right legs may be swapped"
     yield from _find_jumps(clip)
+    checked = np.arange(len(clip))[:: max(1, round(clip.fps / FPS))][:MOST_FRAMES]
+    if len(checked) >= AROUND:
+        rate = clip.fps / checked[1]
+        yield from find_dynamic_faults(_compute_positions(clip, checked), rate, clip.fps)
 
 
 def _find_jumps(clip: Clip) -> Iterator[str]:

@@ -1,8 +1,9 @@
 """Finds clips with common motion, and keeps these clips in one group and in one part of a split.
 
-There are three kinds of copies. The first has equal frames, even if the file was saved again. The second has
+There are four kinds of copies. The first has equal frames, even if the file was saved again. The second has
 a different frame rate (`find_resampled_copies`). The third shares a stretch of motion, such as overlapping
-cuts or a clip played backwards (`find_shared_stretches`). Clips are also compared with mirror images, because
+cuts or a clip played backwards (`find_shared_stretches`). The fourth is another conversion of a take
+(`conversions.find_conversions`). Clips are also compared with mirror images, because
 some data sets contain mirrored motion. Clips without motion do not count as copies.
 
 If the split divides all clips in the folder, all copies of a clip get the same part. A published list may

@@ -15,6 +15,7 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Clip, SkippedFile, resample
 from memmlp.motion.formats.npz import NoMotionError, read_clip
 from memmlp.motion.plausibility import check_plausible
+from memmlp.motion.preparing.conversions import find_conversions, mark_turns
 from memmlp.motion.preparing.duplicates import (
     MarkedFrames,
     compute_first_frames,
@@ -70,6 +71,7 @@ def survey_folder(root: Root, min_frames: int = 2, strict: bool = False) -> Surv
     clips: dict[str, ClipRecord] = {}
     firsts: dict[str, np.ndarray] = {}
     marks: dict[str, tuple[MarkedFrames, MarkedFrames]] = {}
+    turns: dict[str, MarkedFrames] = {}
     odd: dict[str, str] = {}
     short, content = [], find_clips(root)
     skipped = [SkippedFile(folder, reason) for folder, reason in content.unreadable.items()]
@@ -100,10 +102,12 @@ def survey_folder(root: Root, min_frames: int = 2, strict: bool = False) -> Surv
             digests = file_digest(path), _compute_content_digest(clip)
             clips[name] = ClipRecord(name, file, "", "", 0, len(resampled) - 1, *digests, clip.fps, method)
             firsts[name], marks[name] = compute_first_frames(clip), mark_frames(resampled)
+            turns[name] = mark_turns(resampled)
             odd |= {name: faults} if faults else {}
     records = list(clips.values())
     records = merge_contents(records, find_resampled_copies(root, records, firsts))
     records = merge_contents(records, find_shared_stretches(root, records, marks))
+    records = merge_contents(records, find_conversions(root, records, turns))
     return Survey(tuple(records), tuple(skipped), tuple(short), odd)
 
 
