@@ -103,6 +103,10 @@ def test_a_run_s_page_and_its_replay(browser: Browser, server: RunsServer, home:
     assert browser.value("[...document.querySelectorAll('.view-name span')].map(s => s.textContent)") == [
         "Truth", "memory=gru · seed 0", "memory=none · seed 0",
     ]  # fmt: skip
+    corner = "(b => [b.x + 5, b.y + b.height / 2])(document.querySelector('.view').getBoundingClientRect())"
+    browser.value("document.querySelector('.views').scrollIntoView()")
+    x, y = map(round, browser.value(corner))
+    assert browser.picture()[y, x].tolist() == pytest.approx([238, 241, 244], abs=8)  # the stage's colour
     pieces = browser.value("[...document.querySelectorAll('.pieces button')].map(b => b.textContent)")
     assert pieces[0] == "Worst second at 5.0 s: 20.0 cm"
     browser.value("document.querySelector('.transport .primary').click()")

@@ -44,11 +44,8 @@ export class Stage {
 
   // Use the page's colours, light or dark.
   applyTheme() {
-    const { domElement } = this.renderer;
-    const colour = name => {
-      domElement.style.color = `var(${name})`;
-      return new THREE.Color(getComputedStyle(domElement).color);
-    };
+    const style = getComputedStyle(document.documentElement);
+    const colour = name => new THREE.Color(style.getPropertyValue(name).trim());
     this.scene.background = colour('--stage');
     this.scene.fog = new THREE.Fog(this.scene.background, 4, 8);
     this.scene.remove(this.grid);
