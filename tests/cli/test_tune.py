@@ -179,12 +179,11 @@ def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", ["mem_mlp", "avatar_poser", "recurrent_poser"])
-def test_every_trial_trains_for_the_same_compute(network: str, tmp_path: Path):
+def test_every_trial_trains_for_the_same_compute(tmp_path: Path):
     """The batch is searched, and so is the number of steps; the objective is of the best validation."""
-    budget, own = 0.005, [word for word in TINY if "steps" not in word and "validate" not in word]
+    budget, own = 0.001, [word for word in TINY if "steps" not in word and "validate" not in word]
     space = ["search.space.optim=null", "+search.space.optim.batch={choices: [4, 8]}"]
-    words = [f"model={network}", "search=learning_rate", "search.n_trials=2", f"search.tflop={budget}"]
+    words = ["search=learning_rate", "search.n_trials=2", f"search.tflop={budget}"]
     run_apart(tmp_path, "tune", *own, *words, *space, "--workers", "1")
     rows = read_trials(folder_of(tmp_path))
     runs = [Run.from_id(tmp_path / "outputs", row["run"]) for row in rows]
