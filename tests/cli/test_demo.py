@@ -25,11 +25,8 @@ def test_two_networks_side_by_side(memmlp):
 def test_overrides_that_recurrent_poser_cannot_take_are_known_before_training():
     assert is_valid_for_recurrent_poser(["vqvae.steps=7", "optim.steps=500"])
     for words in (
-        ["memory=none"],
-        ["evaluation.ik=lbfgs"],
-        ["model=avatar_poser"],
-        ["experiment=no_memory"],
-    ):
+        ["memory=none"], ["evaluation.ik=lbfgs"], ["model=avatar_poser"], ["experiment=no_memory"],
+    ):  # fmt: skip
         assert not is_valid_for_recurrent_poser(words), words
 
 

@@ -100,8 +100,7 @@ def test_seeds_go_where_verdicts_are_open(memmlp: Memmlp, runs: Runs):
     assert "all verdicts are decided" in ran.out
     assert "19 runs were done; without interim analyses: 24 with 8 seeds for every variant, 39" in ran.out
     before = record()
-    assert (memmlp(*SWEEP).code, len(runs.made)) == (0, 19)
-    assert record() == before
+    assert (memmlp(*SWEEP).code, len(runs.made), record()) == (0, 19, before)
     out = " ".join(memmlp("table", "trial.yaml").out.split())
     for words in ("higher (3)", "equivalent (8)", "seeds were added where verdicts were inconclusive"):
         assert words in out

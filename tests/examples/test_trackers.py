@@ -29,10 +29,8 @@ def test_it_writes_head_and_hands_of_a_clip(space: str, tmp_path: Path, monkeypa
     assert header.split(",")[:8] == ["head.x", "head.y", "head.z", *(f"head.q{a}" for a in "xyzw"), "left.x"]
     found = np.loadtxt(out, delimiter=",", skiprows=1).reshape(-1, 3, 7)
     person = wearer.of_poses(*(torch.tensor(part[::2]) for part in (clip.poses, clip.trans)))
-    np.testing.assert_allclose(
-        found[..., :3], SPACES[space].convert_positions_from_amass(person.positions), atol=1e-6
-    )
+    expected = SPACES[space].convert_positions_from_amass(person.positions)
+    np.testing.assert_allclose(found[..., :3], expected, atol=1e-6)
     turned = Rotation.from_quat(found[..., 3:].reshape(-1, 4)).as_matrix().reshape(-1, 3, 3, 3)
-    np.testing.assert_allclose(
-        turned, SPACES[space].convert_rotations_from_amass(person.rotations), atol=1e-6
-    )
+    expected = SPACES[space].convert_rotations_from_amass(person.rotations)
+    np.testing.assert_allclose(turned, expected, atol=1e-6)

@@ -20,17 +20,13 @@ FORWARD, UP, LEFT = np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.array([-1.0
 @pytest.mark.slow
 @given(names, points, turns)
 def test_there_and_back(name, point, turn):
-    space = SPACES[name]
-    np.testing.assert_allclose(
-        space.convert_positions_from_amass(space.convert_positions_to_amass(point)), point, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        space.convert_rotations_from_amass(space.convert_rotations_to_amass(turn)), turn, atol=1e-12
-    )
-    pose = np.stack([turn, turn.T, turn @ turn])
-    np.testing.assert_allclose(
-        space.convert_pose_from_amass(space.convert_pose_to_amass(pose)), pose, atol=1e-12
-    )
+    space, pose = SPACES[name], np.stack([turn, turn.T, turn @ turn])
+    for here, there, back in (
+        (point, space.convert_positions_to_amass, space.convert_positions_from_amass),
+        (turn, space.convert_rotations_to_amass, space.convert_rotations_from_amass),
+        (pose, space.convert_pose_to_amass, space.convert_pose_from_amass),
+    ):
+        np.testing.assert_allclose(back(there(here)), here, atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(space.convert_pose_from_amass(pose)), 1, atol=1e-9)
 
 
@@ -39,13 +35,10 @@ def test_a_chain_of_joints_is_the_same_in_every_space(name, offset, root, local)
     """A child at a rest offset, turned and moved in AMASS' world or in the space, is the same point."""
     space = SPACES[name]
     there_root, there_local = space.convert_pose_from_amass(np.stack([root, local]))
-    there_offset = offset * space.body  # the T-pose's axes
-    np.testing.assert_allclose(
-        there_root @ there_offset, space.convert_positions_from_amass(root @ offset), atol=1e-9
-    )
-    np.testing.assert_allclose(
-        there_root @ there_local, space.convert_rotations_from_amass(root @ local), atol=1e-9
-    )
+    found = there_root @ (offset * space.body)  # the T-pose's axes
+    np.testing.assert_allclose(found, space.convert_positions_from_amass(root @ offset), atol=1e-9)
+    expected = space.convert_rotations_from_amass(root @ local)
+    np.testing.assert_allclose(there_root @ there_local, expected, atol=1e-9)
 
 
 def test_the_axes():

@@ -60,8 +60,7 @@ def test_it_arrives_as_it_was_without_checkpoint_and_strange_files(run: Run, arc
     there, new = import_run(archive, tmp_path / "there", file_digest(archive))
     assert new
     assert there.done
-    assert (there.verify(), there.config) == ([], run.config)
-    assert there.metrics() == run.metrics()
+    assert (there.verify(), there.config, there.metrics()) == ([], run.config, run.metrics())
     assert there.onnx.read_bytes() == b"onnx"
     assert read_notes(there).tags == ("good",)
     assert not there.checkpoint.exists()

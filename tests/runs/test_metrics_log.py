@@ -5,6 +5,8 @@ import json
 import math
 import os
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock, Mock
 
 import pytest
 from begun_runs import begun, complete
@@ -83,25 +85,18 @@ def test_a_line_that_is_written_late_goes_to_the_old_file(tmp_path: Path):
 
 
 def test_a_line_that_is_half_written_is_an_error_and_then_gone(tmp_path: Path, monkeypatch):
-    run = complete(tmp_path)
+    run, real = complete(tmp_path), open
     run.log(1, {"loss": 1.0})
+
+    def open_full(path: Path, mode: str, **options: Any) -> Mock:
+        file = real(path, mode, **options)
+        full = MagicMock(**{"write.side_effect": lambda line: file.write(line[:9])})
+        full.__enter__.return_value = full
+        full.__exit__.side_effect = lambda *_: file.close()
+        return full
+
     with monkeypatch.context() as full:
-        real = open
-
-        class Short:
-            def __init__(self, file):
-                self.file = file
-
-            def write(self, line: bytes) -> int:
-                return self.file.write(line[:9])
-
-            def __enter__(self):
-                return self
-
-            def __exit__(self, *_):
-                self.file.close()
-
-        full.setattr("builtins.open", lambda path, mode, **options: Short(real(path, mode, **options)))
+        full.setattr("builtins.open", open_full)
         with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
             run.log(2, {"loss": 2.0})
     run.log(3, {"loss": 3.0})

@@ -1,5 +1,6 @@
 """`memmlp data import`, `verify` and `skeleton`."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,17 +38,12 @@ def source(tmp_path: Path) -> Path:
 
 def test_verify_goes_on_and_names_file_joint_and_frame(source: Path) -> None:
     output = run(source.parent, "data", "verify", "source", code=1)
-    lines = output.splitlines()
-    changes = "b.bvh: left_elbow to left_wrist changes its length by 5"
-    assert [line for line in lines if line.startswith(changes) and "(most in frame 31)" in line]
-    assert [line for line in lines if line.startswith("c.bvh: has no MOTION")]
-    assert [line for line in lines if line.startswith("d.bvh: has an unknown skeleton")]
-    assert "1 file without a fault" in output
+    for line in (
+        r"b\.bvh: left_elbow to left_wrist changes its length by 5.*\(most in frame 31\)",
+        r"c\.bvh: has no MOTION", r"d\.bvh: has an unknown skeleton", "1 file without a fault",
+    ):  # fmt: skip
+        assert re.search(f"^{line}", output, re.M), line
     assert "3 faults" in output
-    assert "Traceback" not in output
-
-
-def test_verify_of_sound_files_succeeds(source: Path) -> None:
     assert run(source.parent, "data", "verify", "source/a.bvh").startswith("1 file without a fault")
     (source / "a.bvh").rename(source / "[a].bvh")
     assert "[a].bvh" in run(source.parent, "data", "verify", "source/[a].bvh", "--all")
@@ -107,13 +103,9 @@ def test_a_map_that_does_not_import_fails(tmp_path: Path):
     sample = walking("lafan1", turned=True)
     sample.values[:, 3:] = 0  # nobody stands in the zero pose
     result = skeleton("guess", write(tmp_path, sample.text()))
-    assert result.exit_code == 1
-    assert "joints:" in result.stdout
+    assert (result.exit_code, "joints:" in result.stdout) == (1, True)
     assert "cannot be imported" in result.stderr
-
-
-@pytest.mark.parametrize("out", ["a.gif", "no/a.png"])
-def test_bad_picture_paths_are_refused_before_any_work(tmp_path: Path, out: str):
-    result = skeleton("show", tmp_path / "none.bvh", "--out", tmp_path / out)
-    assert isinstance(result.exception, InputError)
-    assert str(result.exception).startswith("--out")
+    for out in ("a.gif", "no/a.png"):
+        error = skeleton("show", tmp_path / "none.bvh", "--out", tmp_path / out).exception
+        assert isinstance(error, InputError)
+        assert str(error).startswith("--out")  # before any work

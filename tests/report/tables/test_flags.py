@@ -361,7 +361,7 @@ def test_offline_networks_in_every_format(sweep: Sweep, tmp_path: Path):
 
 @pytest.mark.parametrize(("tied", "expected"), [
     (0, "each test clip is a group of its own"),
-    (2, "10 of 12 test clips are groups of their own"),
+    (3, "9 of 12 test clips are groups of their own"),
     (6, None),
 ])  # fmt: skip
 def test_test_clips_with_hardly_any_groups(sweep: Sweep, tmp_path: Path, tied: int, expected: str | None):

@@ -15,10 +15,9 @@ from memmlp.sweep.executors.slurm import (
 )
 
 
-def lines(tmp_path: Path, workers: int = 1, **words: str) -> list[str]:
-    return format_batch_script(
-        tmp_path / "%j", parse_slurm_options({"time": "60", **words}), workers
-    ).splitlines()
+def lines(tmp_path: Path, **words: str) -> list[str]:
+    options = parse_slurm_options({"time": "60", **words})
+    return format_batch_script(tmp_path / "%j", options, 1).splitlines()
 
 
 def test_options_reach_sbatch(tmp_path: Path):
@@ -35,13 +34,21 @@ def test_options_reach_sbatch(tmp_path: Path):
     assert "overcommit" not in "\n".join(found)
 
 
-def test_times_are_slurms(tmp_path: Path):
-    for text, minutes in (
-        ("90", 90), ("90:30", 91), ("10:00:00", 600), ("1:30:01", 91), ("2-0", 2880), ("7-12:30", 10830),
-        ("1-02:03:00", 1563),
-    ):  # fmt: skip
-        assert parse_slurm_options({"time": text}).minutes == minutes
-        assert f"#SBATCH --time={text}" in lines(tmp_path, time=text)
+@pytest.mark.parametrize(("text", "minutes"), [
+    ("90", 90), ("90:30", 91), ("10:00:00", 600), ("1:30:01", 91), ("2-0", 2880), ("7-12:30", 10830),
+    ("1-02:03:00", 1563),
+])  # fmt: skip
+def test_times_are_slurms(tmp_path: Path, text: str, minutes: int):
+    assert parse_slurm_options({"time": text}).minutes == minutes
+    assert f"#SBATCH --time={text}" in lines(tmp_path, time=text)
+
+
+@pytest.mark.parametrize(("settings", "gpu"), [
+    ({"gpus": "1"}, True), ({"gpus": "a100:2"}, True), ({"gpus_per_task": "1"}, True),
+    ({"gres": "gpu:1"}, True), ({"gres": "disk:1"}, False), ({"mem_per_gpu": "8G"}, False), ({}, False),
+])  # fmt: skip
+def test_whether_a_job_is_to_have_a_gpu(settings: dict[str, str], gpu: bool):
+    assert parse_slurm_options({"time": "60", **settings}).gpu is gpu
 
 
 def test_a_container_is_srun_s(tmp_path: Path):
@@ -52,15 +59,6 @@ def test_a_container_is_srun_s(tmp_path: Path):
         assert f" {word} " in command
     assert " python3 -u -m submitit" in command
     assert not [line for line in found if line.startswith("#SBATCH --container")]
-
-
-def test_whether_a_job_is_to_have_a_gpu():
-    for settings, gpu in (
-        ({"gpus": "1"}, True), ({"gpus": "a100:2"}, True), ({"gpus_per_task": "1"}, True),
-        ({"gres": "gpu:1"}, True),
-        ({"gres": "disk:1"}, False), ({"mem_per_gpu": "8G"}, False), ({}, False),
-    ):  # fmt: skip
-        assert parse_slurm_options({"time": "60", **settings}).gpu is gpu, settings
 
 
 def test_bad_options_are_one_line():

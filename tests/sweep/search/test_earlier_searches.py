@@ -51,8 +51,7 @@ def test_the_summary_has_budgets_and_best_trials(tmp_path: Path):
     assert second.startswith("| seed-3 | model=mem_mlp | - | 5.1 to 5.1 | 6 of 6 | MPJPE ")
     assert " ± " in second
     rows = list(csv.DictReader(format_trials(searches).splitlines()))
-    assert len(rows) == 12
-    assert {row["network"] for row in rows[:6]} == {"model=rpm"}
+    assert (len(rows), {row["network"] for row in rows[:6]}) == (12, {"model=rpm"})
     assert all(float(row["loss.hand"]) > 0 for row in rows)
     assert rows[-1]["tflop"] == "5.1 5.1"
 

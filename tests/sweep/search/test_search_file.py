@@ -42,11 +42,8 @@ def test_an_objective_is_a_weighted_sum(text: str, value: float):
         "position MPJPE": 5.0, "position Hand PE": 1.0,
     }  # fmt: skip
     assert made(objectives=[text]).objectives[0].value(metrics) == pytest.approx(value)
-
-
-def test_an_objective_that_is_not_validated_is_named():
     with pytest.raises(InputError, match="'position MPJRE' is not validated"):
-        made(objectives=["position MPJRE"]).objectives[0].value({"rotation MPJPE": 1.0})
+        made(objectives=["position MPJRE"]).objectives[0].value(metrics)
 
 
 WRONG: list[tuple[dict[str, Any], str]] = [
@@ -95,8 +92,5 @@ def test_what_is_wrong_is_named():
         with pytest.raises(InputError) as caught:
             made(**changes)
         assert words in str(caught.value), changes
-
-
-def test_a_key_that_was_taken_away_is_named():
     with pytest.raises(InputError, match=r"search\.n_trials: has no value"):
         parse_search({key: value for key, value in GOOD.items() if key != "n_trials"})
