@@ -35,7 +35,7 @@ def test_means_have_a_variance_of_one():
         assert a + b - e == pytest.approx(1, abs=0.06 if shares.groups else 0.2), name
 
 
-def test_a_cell_is_reproducible_and_interim_analyses_save_seeds():
+def test_a_cell_is_reproducible_and_broken_promises_are_listed():
     assert len(grid()) == 40
     small, large = SimulationSetting(3, 4, 2), SimulationSetting(10, 40, 1)
     assert simulate(small, 20, 1) == simulate(small, 20, 1) != simulate(small, 20, 2)
@@ -43,9 +43,6 @@ def test_a_cell_is_reproducible_and_interim_analyses_save_seeds():
     assert campaign["decided"] > 0.95
     assert campaign["seeds"] < 9
     assert campaign["error"] <= 0.05
-
-
-def test_a_broken_promise_is_listed():
     row = {"tables": 1000, "shares": {"one": {"coverage": 0.95, "error": 0.05, "sequential_error": 0.03}}}
     assert broken(row, True) == []
     row["shares"]["other"] = {"coverage": 0.999, "error": 0.09, "sequential_error": 0.01}

@@ -21,7 +21,7 @@ def test_a_remark_is_shown_on_a_terminal_too(capsys, monkeypatch: pytest.MonkeyP
     assert told == ["data: 1 file was skipped"]
 
 
-def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
+def test_long_work_tells_how_far_it_is_by_unit_and_stage(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
     with send_announcements_to(told.append), progress.show_progress("network", 4000, done=398) as count:
@@ -30,9 +30,6 @@ def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
         count.advance()
     assert told[0].startswith("network: 399 of 4000")
     assert re.fullmatch(r"network: 400 of 4000, loss 2\.31(, \d+ (s|min) left)?", told[1])
-
-
-def test_a_line_names_the_unit_and_the_stage(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
     with send_announcements_to(told.append):

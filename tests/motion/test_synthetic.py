@@ -85,7 +85,7 @@ def test_files_are_in_amass_layout_and_last_as_long_as_asked(tmp_path):
     assert len(set(paths)) == len(paths)
 
 
-def test_a_little_is_three_short_clips(tmp_path):
+def test_a_little_is_three_short_clips_and_bad_arguments_are_named(tmp_path):
     """There is one clip for each part of a split."""
     for seconds in (0.01, 1.0):
         paths = synthesize(tmp_path / str(seconds), minutes=seconds / 60)
@@ -93,9 +93,6 @@ def test_a_little_is_three_short_clips(tmp_path):
         assert len(lengths) == 3
         assert sum(lengths) == max(6, seconds * 60)
         assert min(lengths) >= max(2, 0.6 / 1.4 * sum(lengths) / 5)
-
-
-def test_bad_arguments_are_named(tmp_path):
     for key, value in (("minutes", 0.0), ("minutes", float("nan")), ("fps", 0.0), ("fps", 1e9), ("seed", -1)):
         with pytest.raises(InputError, match=f"^{key}="):
             synthesize(tmp_path / "out", **{key: value})

@@ -19,13 +19,19 @@ def gpus(monkeypatch: pytest.MonkeyPatch):
     return there
 
 
-def test_with_two_gpus(gpus):
+def test_with_two_gpus(gpus, monkeypatch: pytest.MonkeyPatch):
     gpus(2)
     found = {name: str(choose_device(name)) for name in ("auto", "cpu", "cuda", "cuda:1")}
     assert found == {"auto": "cuda:0", "cpu": "cpu", "cuda": "cuda:0", "cuda:1": "cuda:1"}
     with pytest.raises(InputError, match="device=cuda:2: must be cuda:0 to cuda:1"):
         choose_device("cuda:2")
     assert describe_missing_gpu() is None
+    gpus(2)
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert str(choose_device("auto")) == "cuda:1"
+    with pytest.raises(InputError, match="device=cuda:1: must be cuda with several"):
+        choose_device("cuda:1")
 
 
 def test_float32_is_no_tf32_on_a_gpu(gpus, monkeypatch: pytest.MonkeyPatch):
@@ -48,15 +54,6 @@ def test_without_gpus(gpus, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     assert "torch" in str(describe_missing_gpu())
     assert "CUDA_VISIBLE_DEVICES is '3'" in str(describe_missing_gpu())
-
-
-def test_of_several_processes_each_has_its_own(gpus, monkeypatch: pytest.MonkeyPatch):
-    gpus(2)
-    monkeypatch.setattr(distributed, "world_size", lambda: 2)
-    monkeypatch.setenv("LOCAL_RANK", "1")
-    assert str(choose_device("auto")) == "cuda:1"
-    with pytest.raises(InputError, match="device=cuda:1: must be cuda with several"):
-        choose_device("cuda:1")
 
 
 def test_a_gpu_that_torch_cannot_use_is_told(gpus, monkeypatch, tmp_path):

@@ -97,7 +97,7 @@ def test_terms_of_rotations():
     assert terms(**dict.fromkeys(expected, 1.0)) == pytest.approx(expected, rel=1e-3)
 
 
-def test_errors_are_of_components_or_of_joints(bodies):
+def test_errors_are_of_components_or_of_joints_and_terms_are_weighted(bodies):
     made, true = bodies
     error = made - true
     expected = {
@@ -108,9 +108,6 @@ def test_errors_are_of_components_or_of_joints(bodies):
     }
     found = {name: terms(error=name, world_position=1.0)["world_position"] for name in ERRORS}
     assert found == pytest.approx(expected, rel=1e-3)
-
-
-def test_a_weight_of_none_leaves_a_term_out_and_the_others_are_summed():
     loss = TermsLoss(rotation=2.0, jerk=None, hand=0.5)
     total, parts = loss(MADE, TRUE[..., SPARSE_DIM:], TRUE[..., :SPARSE_DIM], NORMALIZER)
     assert list(parts) == ["rotation", "hand"]

@@ -49,7 +49,7 @@ def test_hand_terms_are_of_the_rotation_branch_or_left_out():
     assert set(terms(KinematicHandTerm(), rotation)) == {"rotation_all", "rotation_velocity", "hand"}
 
 
-def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
+def test_weights_settle_at_one_over_the_loss_and_custom_terms_have_their_own():
     """The minimum of e^-s L + s is s = ln L."""
     weighting = losses.UncertaintyWeights(lr=0.05)
     weighting.build(["rotation_all", "position_branch"])
@@ -61,9 +61,6 @@ def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
         optimiser.step()
     assert weighting.weights() == pytest.approx({"rotation_all": 1 / 4, "position_branch": 10}, rel=1e-2)
     assert weighting.s["rotation_all"].item() == pytest.approx(math.log(4), rel=1e-2)
-
-
-def test_a_custom_term_has_its_own_weight_also_under_the_name_of_a_term_that_is_not_there():
     weighting = ManualWeights()
     weighting.build(["rotation_all", "hand"], {"hand": 7.0})
     terms = {"rotation_all": torch.tensor(1.0), "hand": torch.tensor(1.0)}

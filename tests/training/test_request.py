@@ -55,7 +55,7 @@ def test_clips_that_were_recorded_at_a_lower_rate_are_said():
     assert "2 of 6 test clips were" in warnings(clips, interpolation="lines")["resampled"]
 
 
-def test_a_part_of_the_data_is_told():
+def test_a_part_of_the_data_or_of_a_protocol_is_told():
     """A protocol with a part of its training clips is not the protocol, and says so."""
     for whole, fraction, words in (
         (True, None, None),
@@ -68,10 +68,6 @@ def test_a_part_of_the_data_is_told():
         coverage = mock.MagicMock(is_complete=whole, __str__=lambda _: "7 of 8")
         found = warnings([], "s1", part, coverage=coverage, interpolation="lines")
         assert found["partial"] == words
-
-
-def test_a_protocol_without_some_of_its_subsets_is_told():
-    """Lists of one subset, or its folder alone, are whole in themselves, and no protocol."""
     for name, listed, clips, words in (
         ("amass_s1", ["CMU", "BMLrub", "HDM05"], ["CMU/1/a"], None),
         ("amass_s1", ["CMU"], ["CMU/1/a"], "1 of 3 subsets (without BioMotionLab_NTroje, MPI_HDM05)"),

@@ -137,6 +137,9 @@ def test_wrong_content_is_one_line(tmp_path):
         path.write_bytes(content)
         with pytest.raises(InputError, match=rf"^{path}.*\Z"):
             read_clip(path, "bad")
+    np.savez(tmp_path / "shape.npz", betas=np.zeros(16))
+    with pytest.raises(NoMotionError):
+        read_clip(tmp_path / "shape.npz", "shape")
 
 
 def test_damaged_entries_are_one_line(tmp_path):
@@ -185,9 +188,3 @@ def test_files_that_unpack_to_much_are_refused_before_they_do(tmp_path, monkeypa
     assert said in data
     path.write_bytes(data.replace(said, lie))
     assert peak_of_refusal(path, "poses") < 500_000
-
-
-def test_an_npz_without_motion_is_known(tmp_path):
-    np.savez(tmp_path / "shape.npz", betas=np.zeros(16))
-    with pytest.raises(NoMotionError):
-        read_clip(tmp_path / "shape.npz", "shape")

@@ -24,14 +24,11 @@ def test_segments_go_on_past_joints_that_are_missing() -> None:
     assert not [name for name in names if "left_foot" in name]
 
 
-def test_angles_are_accurate() -> None:
+def test_angles_and_least_rotations_are_accurate() -> None:
     for size in (1e-9, 1.0, np.pi - 1e-6):
         turned = 3 * Rotation.from_rotvec([0, 0, size]).apply([1.0, 0, 0])
         found = anatomy.compute_angles(np.array([2.0, 0, 0]), turned)
         assert found == pytest.approx(np.degrees(size), rel=1e-6)
-
-
-def test_least_rotation_turns_one_direction_onto_another_also_its_opposite() -> None:
     random = np.random.default_rng(0)
     a, b = anatomy.normalize_vectors(random.normal(size=(2, 50, 3)))
     ways = np.concatenate([np.eye(3), -np.eye(3), [[1, 1, 1], [0.5, -2, 0]]])

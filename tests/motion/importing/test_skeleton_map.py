@@ -96,7 +96,7 @@ def test_a_map_of_other_joints_is_refused(tmp_path: Path) -> None:
         pick_joints(bvh, replace(chosen, joints=swapped))
 
 
-def test_namespaces_are_left_out():
+def test_names_of_nodes():
     for nodes, plain in (
         ("mixamorig:Hips mixamorig:LeftArm", "Hips LeftArm"), ("mixamorigHips mixamorigHead", "Hips Head"),
         ("Character1_Hips Character1_LeftArm", "Hips LeftArm"), ("a:Hips b:Hips", "a:Hips b:Hips"),
@@ -105,9 +105,6 @@ def test_namespaces_are_left_out():
         ("Armature a:b:Hips a:b:Head", "Armature Hips Head"), ("Spine Spine1 Spine2", "Spine Spine1 Spine2"),
     ):  # fmt: skip
         assert skeleton_map.strip_namespace(nodes.split()) == plain.split()
-
-
-def test_nodes_are_found_by_their_very_name_first():
     nodes = ["Spine1", "spine_1", "Head"]
     assert skeleton_map.find_nodes(nodes, ["spine_1"]) == {"spine_1": "spine_1"}
     assert skeleton_map.find_nodes(nodes, ["SPINE1"]) is None  # either could be meant

@@ -32,7 +32,7 @@ def test_seeded_is_a_partition_whatever_the_order():
     assert seeded(0.2, 0.1, 4).assign(NAMES).parts != parts
 
 
-def test_subjects_within_archives_are_drawn_as_those_without():
+def test_groups_and_subjects_within_archives_stay_together():
     names = [f"CMU/{subject:02}/{subject:02}_0{take}_poses" for subject in range(20) for take in range(3)]
     split = seeded(0.2, 0.2, 1, ["^([^/]+/[^/]+)/"])
     expected = split.assign(names).parts
@@ -40,9 +40,6 @@ def test_subjects_within_archives_are_drawn_as_those_without():
         assert split.assign([*map(write, names)]).parts == {
             write(one): part for one, part in expected.items()
         }
-
-
-def test_groups_stay_on_one_side():
     for seed in range(5):
         parts = seeded(0.2, 0.2, seed, TWINS).assign(NAMES).parts
         assert all(parts[f"salsa/{n:02}"] == parts[f"salsa/{n + 15:02}"] for n in range(1, 16))
@@ -107,7 +104,7 @@ def test_lists_in_agrols_format(tmp_path):
     assert ListSplit(tmp_path).entry_counts == {"CMU": 9}
 
 
-def test_subsets_by_folder():
+def test_subsets_by_folder_under_every_name_but_once():
     names = [f"{subset}/{n}" for subset in (*S2_TRAIN, *S2_TEST, "DanceDB") for n in range(4)]
     parts = SubsetSplit(S2_TRAIN, S2_TEST, val=0.1).assign(names).parts
     assert {name.split("/")[0] for name in part(parts, "test")} == set(S2_TEST)
@@ -115,6 +112,14 @@ def test_subsets_by_folder():
     assert "val" in parts.values()
     lower = SubsetSplit(S2_TRAIN, S2_TEST).assign(["cmu/1", "cmu/2", "cmu/3", "humaneva/1"]).parts
     assert lower["humaneva/1"] == "test"
+    split = SubsetSplit(["BioMotionLab_NTroje", "CMU"], ["MPI_HDM05"], groups=["^([^/]+/[^/]+)/"])
+    for write in (renamed, stage_two, in_archives, str.lower):
+        found = split.assign([write(name) for name in OLD])
+        assert None not in found.parts.values()
+        assert len(set(found.groups.values())) == 6
+    assert split.find_missing_entries(OLD[:8]) == ("CMU", "MPI_HDM05")
+    with pytest.raises(InputError, match=r"data\.root"):
+        split.assign([*OLD, stage_two(OLD[0])])
 
 
 def test_bad_fractions_patterns_lists_and_subsets(tmp_path):
@@ -179,17 +184,6 @@ def test_an_entry_is_the_file_of_its_name_and_two_others_are_refused(tmp_path):
     assert split.assign(both).parts[stage_two(OLD[0])] is None
     with pytest.raises(InputError, match=r"BMLrub/.*_poses.npz and BMLrub/.*_stageii.npz"):
         split.assign([renamed(OLD[0]), stage_two(OLD[0]), *OLD[1:]])
-
-
-def test_subsets_under_every_name_but_once():
-    split = SubsetSplit(["BioMotionLab_NTroje", "CMU"], ["MPI_HDM05"], groups=["^([^/]+/[^/]+)/"])
-    for write in (renamed, stage_two, in_archives, str.lower):
-        found = split.assign([write(name) for name in OLD])
-        assert None not in found.parts.values()
-        assert len(set(found.groups.values())) == 6
-    assert split.find_missing_entries(OLD[:8]) == ("CMU", "MPI_HDM05")
-    with pytest.raises(InputError, match=r"data\.root"):
-        split.assign([*OLD, stage_two(OLD[0])])
 
 
 def test_a_column_file_ties_clips_beside_patterns(tmp_path):
