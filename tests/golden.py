@@ -283,13 +283,11 @@ CASES: dict[str, Callable[[], Numbers]] = {
         }.items()
     },
     **{
-        f"predictor.{name}": partial(lambda kind: network(tiny.model(MemoryWithoutCodes, kind)), kind)
-        for name, kind in {
-            "two_branch": predictor.TwoBranchSettings,
-            "two_branch_memory": predictor.TwoBranchMemorySettings,
-            "rotation_only": predictor.RotationOnlySettings,
-            "rotation_only_memory": predictor.RotationOnlyMemorySettings,
-        }.items()
+        f"predictor.{kind.name}": partial(lambda kind: network(tiny.model(MemoryWithoutCodes, kind)), kind)
+        for kind in (
+            predictor.TwoBranchSettings, predictor.TwoBranchMemorySettings, predictor.RotationOnlySettings,
+            predictor.RotationOnlyMemorySettings,
+        )
     },
     "refiner.sage": refiner,
     "prerequisite.sage": parts,
