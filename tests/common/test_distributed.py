@@ -1,23 +1,72 @@
 """A run trained by several processes is the run that one process trains with the same whole batch."""
 
+import os
 import shutil
 import signal
 import socket
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from processes import PATIENCE, forked
-from shared_training import STEPS, dying, optim_of, precise, together
-from tiny_tasks import motion_task, weights
+from tiny_tasks import OPTIM, TASKS, motion_task, weights
 from torch import nn
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
-from memmlp.training.loop import check_processes, train
+from memmlp.training.loop import TrainingTask, check_processes, train
+from memmlp.training.optim import Muon, Optim
+from memmlp.training.train_network import VQVAETask
+
+STEPS = replace(OPTIM, steps=14, checkpoint_every=6, validate_every=7)
+OPTIMS = {"muon": Muon(**asdict(replace(STEPS, ema=0.9)))}
+DEATH = 9  # the step at which the second process dies
+
+
+def optim_of(name: str) -> Optim:
+    return OPTIMS.get(name, STEPS)
+
+
+def precise(name: str) -> TrainingTask:
+    """A task in float64: in float32 two trainings differ within tens of steps, by the order of sums."""
+    task = TASKS[name](optim=optim_of(name))
+    task.module.double()
+    task.dataset.frames = task.dataset.frames.double()
+    if isinstance(task, VQVAETask):
+        task.normalizer.double()
+        task.validation.frames = task.validation.frames.double()
+    return task
+
+
+def together(folder: Path, *names: str) -> None:
+    """Train tasks in this process, one of several, each in FOLDER/TASK from its checkpoint.
+
+    In a task named die=TASK the second process is killed on the way.
+    """
+    distributed.connect("cpu")
+    for word in names:
+        name = word.removeprefix("die=")
+        task = precise(name)
+        if name != word and distributed.rank() == 1:
+            task.step = dying(task.step, partial(os.kill, os.getpid(), signal.SIGKILL))
+        train(task, optim_of(name), Run(folder / name), 0, name)
+
+
+def dying(step: Callable, die: Callable[[], object]) -> Callable:
+    """A step that dies at number DEATH."""
+
+    def last(number: int) -> object:
+        if number == DEATH:
+            die()
+        return step(number)
+
+    return last
+
 
 NAMES = ("streams", "joint", "avatar_poser", "agrol_diffusion", "muon", "vqvae")
 """Tasks with all that could differ: states, blends, passes, codes that restart, dropout, noise, averages."""
