@@ -47,6 +47,7 @@ class SeededSplitConfig(SplitConfig):
     name: str = setting(one_of("seeded"), "seeded")
     test: float = setting(fraction())
     per_group: int | None = setting(at_least(1), None)
+    divide: str = setting(one_of("groups", "clips"), "groups")
 
 
 @dataclass

@@ -56,7 +56,7 @@ def assign_parts(
     """
     assignment = split.assign([clip.name for clip in clips])
     groups = merge_groups(clips, assignment.groups)
-    if split.entry_counts or groups == assignment.groups:
+    if split.copies_give_way or groups == assignment.groups:
         parts, gave_way = drop_copies_across_parts(clips, assignment.parts)
         return parts, groups, gave_way
     firsts: dict[str, str] = {}

@@ -15,7 +15,7 @@ import hashlib
 import json
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,11 @@ class Split:
 
     groups_digest: str | None
     """A digest of the column files that group the clips; None without a file."""
+
+    @property
+    def copies_give_way(self) -> bool:
+        """Whether copies in several parts stay in one of them; otherwise copies are drawn together."""
+        return bool(self.entry_counts)
 
     def assign(self, names: Sequence[str]) -> Assignment:
         """Return the part and the group of each clip. Raises InputError if the split is impossible."""
@@ -192,22 +197,28 @@ class SeededSplit(GroupedSplit):
         test: fraction of the groups for test; 0 leaves test empty.
         per_group: maximum number of clips of a group in test and in validation. The other clips are left out,
             because repetitions of a motion add little information. None uses all clips.
+        divide: `groups`, or `clips`: the clips of a group may be in several parts, as in published lists. The
+            fractions are those of clips, and groups count in statistics only.
     """
 
     test: float = 0.1
     val: float = 0.1
     per_group: int | None = None
+    divide: str = "groups"
 
     def __post_init__(self) -> None:
         self._check_fractions(test=self.test, val=self.val)
 
     def assign(self, names: Sequence[str]) -> Assignment:
         aliases = {name: strip_archives(name) for name in names}
-        parts, groups = (
-            self._divide_groups(aliases, {"test": self.test, "val": self.val}),
-            self.grouping.name_groups(aliases),
-        )
+        units = replace(self, groups=(), groups_file=None) if self.copies_give_way else self
+        parts = units._divide_groups(aliases, {"test": self.test, "val": self.val})
+        groups = self.grouping.name_groups(aliases)
         return Assignment(self.limit_group_sizes(parts, groups), groups)
+
+    @property
+    def copies_give_way(self) -> bool:
+        return self.divide == "clips"
 
     def limit_group_sizes(
         self, parts: Mapping[str, str | None], groups: Mapping[str, str]
@@ -223,7 +234,8 @@ class SeededSplit(GroupedSplit):
 
     def describe(self) -> dict[str, Any]:
         most = {"per_group": self.per_group} if self.per_group else {}
-        return {"kind": "seeded", "test": self.test, **self._describe_settings(), **most}
+        divide = {"divide": "clips"} if self.copies_give_way else {}
+        return {"kind": "seeded", "test": self.test, **self._describe_settings(), **most, **divide}
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tarfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +17,6 @@ from memmlp.motion.importing.import_folder import import_folder
 from memmlp.motion.preparing.conversions import BONES, mark_turns
 from memmlp.motion.preparing.survey import survey_folder
 from memmlp.motion.synthetic import synthesize_clip
-
-DATA = Path(__file__).parents[4] / "shared" / "data"
 
 
 def convert(clip: Clip, seed: int) -> Clip:
@@ -61,14 +59,10 @@ def test_short_and_still_clips_have_no_marks():
 
 
 @pytest.mark.slow
-def test_two_conversions_of_cmus_takes_are_copies(tmp_path: Path):
-    for form in ("motionbuilder", "daz"):
-        archive = DATA / "cmu-bvh" / f"cmu-{form}.tar.xz"
-        if not archive.is_file():
-            pytest.skip(f"needs {archive.name}, which is not part of the project")
-        with tarfile.open(archive) as file:
-            for take in ("05_06", "05_20"):
-                file.extract(f"cmu-{form}/05/{take}.bvh", tmp_path, filter="data")
-        import_folder(tmp_path / f"cmu-{form}", tmp_path / "clips" / form)
-    expected = {f"motionbuilder/05/{take}": f"daz/05/{take}" for take in ("05_06", "05_20")}
+def test_two_conversions_of_cmus_takes_are_copies(tmp_path: Path, database: Callable[[str], Path]):
+    for form, suffix in (("asfamc", "amc"), ("motionbuilder", "bvh")):
+        for path in (database(f"cmu-{form}") / f"cmu-{form}" / "05").glob(f"05_0[1-4].{suffix}"):
+            import_folder(path, tmp_path / "clips" / form / path.stem)
+    takes = ("05_01", "05_02", "05_03", "05_04")
+    expected = {f"motionbuilder/{take}/{take}": f"asfamc/{take}/{take}" for take in takes}
     assert survey_folder(tmp_path / "clips").duplicates == expected

@@ -1,7 +1,7 @@
 """Splits by person: nobody of validation or test is in training."""
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.persons import Kind, PersonSplit
+from memmlp.motion.preparing.splits import Split
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 DAZ = ("01", "02", "03", "05", "07", "08", "09", "10", "11", "13", "14")  # its subjects
@@ -34,6 +35,10 @@ def shipped(tmp_path: Path) -> MotionSource:
     (tmp_path / "clips").mkdir()
     outputs = f"paths.outputs={tmp_path / 'outputs'}"
     return build_motion(compose_config(["data=persons", f"data.root={tmp_path / 'clips'}", outputs]))
+
+
+def compose_split(data: str, root: Path) -> Split:
+    return build_motion(compose_config([f"data={data}", f"data.root={root}"])).clips.split
 
 
 def members(persons: Iterable[str]) -> list[str]:
@@ -116,6 +121,25 @@ def test_the_shipped_persons_are_in_one_part_of_the_manifest(shipped: MotionSour
     (Path(str(shipped.clips.root)) / "hdm05-asfamc" / "bk" / "HDM_bk_x.npz").unlink()
     with pytest.raises(InputError, match=r"1 of 22 entries .* \(hdm05 1 of 4\); data\.partial=true"):
         shipped.prepare()
+
+
+def test_the_takes_of_s1_are_in_their_lists_part(tmp_path: Path):
+    split = compose_split("cmu_s1", tmp_path)
+    parts = {
+        "test": ["cmu-asfamc/05/05_04", "cmu-daz/07/07_08", "cmu-asfamc/16/16_34", "cmu-asfamc/35/35_29"],
+        "train": ["cmu-asfamc/05/05_05", "cmu-daz/08/08_02", "cmu-asfamc/16/16_35", "cmu-3dsmax/131/131_01"],
+        None: ["cmu-daz/05/05_04", "cmu-asfamc/16/16_01", "cmu-daz/14/14_31", "cmu/salsa/01", "x/HDM_bd_1"],
+    }
+    found = split.assign([name for names in parts.values() for name in names])
+    assert found.parts == {name: part for part, names in parts.items() for name in names}
+    assert split.entry_counts == {"test": 17}
+
+
+@pytest.mark.slow
+def test_the_takes_of_s1_are_as_many_as_in_the_lists(tmp_path: Path, database: Callable[[str], Path]):
+    names = [f"cmu-asfamc/05/{take.stem}" for take in database("cmu-asfamc").rglob("*.amc")]
+    parts = compose_split("cmu_s1", tmp_path).assign(names).parts
+    assert Counter(parts.values()) == {"train": 77, "test": 9, None: 56}
 
 
 @pytest.mark.slow

@@ -1,14 +1,20 @@
 """Splits: seeded, by group, by published lists, by subset."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from memmlp.common.errors import InputError
+from memmlp.config.build_request import build_motion
+from memmlp.config.compose import compose_config
+from memmlp.config.plugins import find_packaged_folder
 from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
+from memmlp.sweep.sweep_file import load_sweep
 
 NAMES = [f"salsa/{n:02}" for n in range(1, 31)] + [f"martial/{n:02}" for n in range(1, 11)]
 TWINS = [rf"salsa/(?:{n:02}|{n + 15:02})$" for n in range(1, 16)]
@@ -30,6 +36,22 @@ def test_seeded_is_a_partition_whatever_the_order():
     counts = [list(parts.values()).count(part) for part in ("train", "val", "test")]
     assert counts == [28, 4, 8]
     assert seeded(0.2, 0.1, 4).assign(NAMES).parts != parts
+
+
+def test_s3_is_as_table_3_says(tmp_path: Path):
+    """By clip and in S1's ratio, with persons on both sides, who still are the groups of statistics."""
+    names = [f"KIT/{subject}/take{take:02}_poses" for subject in range(10) for take in range(40)]
+    split = build_motion(compose_config(["data=amass_s3", f"data.root={tmp_path}"])).clips.split
+    assert isinstance(split, SeededSplit)
+    table = load_sweep(find_packaged_folder("sweeps") / "table03.yaml")
+    (note,) = (line for line in table.notes if "split" in line)
+    percent, seed = re.search(r"by clip .*, (\d+) % for testing, drawn with seed (\d+)", note).groups()
+    assert (split.test, split.seed) == (int(percent) / 100, int(seed))
+    found = split.assign(names)
+    assert len(part(found.parts, "test")) == split.test * len(names)
+    sides = {side: {found.groups[name] for name in part(found.parts, side)} for side in ("train", "test")}
+    assert sides["test"] <= sides["train"]
+    assert len(sides["train"]) == 10
 
 
 def test_groups_and_subjects_within_archives_stay_together():
