@@ -69,7 +69,6 @@ def test_mode_branch_and_inverse_kinematics_are_told(home: Path, run: str, clip:
 
 
 def test_foreign_clips_need_the_run_alone(home: Path, run: str, tmp_path: Path):
-    """No cache and no data of the run; names are kept, and a bad clip is skipped and named."""
     shutil.copytree(home / "outputs" / "runs", tmp_path / "outputs" / "runs")
     shutil.copytree(home / "clips", tmp_path / "clips")
     (tmp_path / "clips" / "bad.npz").write_bytes(b"none")

@@ -38,7 +38,6 @@ def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
 
 
 def test_one_kept_seed_of_three_is_no_finished_table(memmlp: Memmlp, planned: None):
-    """Seeds count beside those of the sweep's definition; more of them may be kept than it asks for."""
     memmlp("results", "save", "14", "seed=1")
     memmlp("results", "docs")
     page = Path("docs/results/table14.md")
@@ -50,7 +49,6 @@ def test_one_kept_seed_of_three_is_no_finished_table(memmlp: Memmlp, planned: No
 
 
 def test_pages_without_data_go(memmlp: Memmlp, planned: None):
-    """Generated pages are removed with their data; a page that was written by hand stays."""
     memmlp("results", "save", "14", "--name", "small")
     memmlp("results", "docs")
     Path("docs/results/notes.md").write_text("by hand\n")

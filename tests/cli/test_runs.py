@@ -90,7 +90,6 @@ def test_diff(memmlp: Memmlp, outputs: Path):
 
 
 def test_list_names_the_networks_that_hardly_saw_motion(memmlp: Memmlp, outputs: Path):
-    """Of finished ones alone: one that trains has seen less than its config says."""
     said = "hardly trained, ignore the errors:"
     assert said not in memmlp("runs", "list").out
     little = {"model": {"frames": 41}, "optim": {"steps": 20, "batch": 8}}

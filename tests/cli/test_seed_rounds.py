@@ -148,7 +148,6 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
 
 
 def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monkeypatch: pytest.MonkeyPatch):
-    """A variant whose network diverged on every clip, or all with one group of clips."""
     with monkeypatch.context() as patch:
         patch.setitem(FACTORS, "same", float("nan"))
         out = memmlp(*SWEEP).out
@@ -164,7 +163,6 @@ def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monk
 
 @pytest.mark.slow
 def test_what_is_kept_says_that_seeds_were_spent_in_rounds(memmlp: Memmlp, runs: Runs):
-    """What was decided stands for no other seeds, and for no other smallest effect of interest."""
     memmlp(*SWEEP)
     memmlp("results", "save", "trial.yaml", "--name", "chosen", "seed=0,1,2")
     memmlp("results", "save", "trial.yaml")

@@ -37,7 +37,6 @@ def test_tables_of_sources_are_of_the_evaluation_that_is_shown(tmp_path: Path):
 
 @pytest.mark.parametrize(("steps", "told"), [(2000, False), (20, True)])
 def test_a_network_that_hardly_saw_motion_says_so(tmp_path: Path, capsys, steps: int, told: bool):
-    """Brackets in a folder's name are shown."""
     config = {"optim": {"steps": steps, "batch": 8}, "model": {"frames": 11}}
     run = fake_run(tmp_path / "[old]", "a", config=config)
     show(Outcome(run, (), {}, ()))

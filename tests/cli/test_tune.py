@@ -44,7 +44,6 @@ def folder_of(home: Path) -> Path:
 
 
 def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
-    """A trial's value is the mean of its two seeds."""
     said = (home / "said.txt").read_text()
     assert "2 of 2 trials: 2 complete" in said
     assert "importance: needs 25 complete trials" in said
@@ -154,7 +153,6 @@ def test_a_search_is_named_after_what_later_trials_follow_from_too(tmp_path: Pat
 
 
 def test_a_folder_of_ones_own_searches(tmp_path: Path):
-    """Of keys that change nothing in the base (a warm-up of 0), and of training data."""
     (tmp_path / "own/search").mkdir(parents=True)
     space = "space: {loss: null, optim: {warmup: {low: 0, high: 3}}}"
     text = f"defaults: [loss_weights, _self_]\nname: rates\nbase: []\n{space}\n"

@@ -27,7 +27,6 @@ PUBLISHED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_paper_profile_has_the_published_size(name, monkeypatch):
-    """Weights are counted, not drawn."""
     monkeypatch.setattr("torch.nn.Linear.reset_parameters", lambda layer: None)
     monkeypatch.setattr("torch.Tensor.normal_", lambda tensor, *_, **options: tensor.zero_())
     architecture = build_experiment(compose_config([f"model={name}", "profile=paper"])).architecture

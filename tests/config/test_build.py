@@ -90,7 +90,6 @@ def variants(axis: str) -> list[list[str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", TRAINED)
 def test_every_value_trains_streams_and_changes_something(axis, home):
-    """Its weights' shapes, its loss, its motion or its branches."""
     base, *others = (trained(*words) for words in variants(axis))
     for arm in (base, *others):
         assert arm.motion.shape == (12, 198)
@@ -120,7 +119,6 @@ EXPORTED = [
 @pytest.mark.slow
 @pytest.mark.parametrize("overrides", EXPORTED, ids=" ".join)
 def test_every_kind_of_graph_exports(overrides, tmp_path):
-    """With random weights and codes, over a clip of noise."""
     model = network([*TINY, *SMALL, "vqvae.encoder_depth=1", "vqvae.decoder_depth=1", *overrides])
     export(model, tmp_path / "step.onnx", "0" * 16)
     clip = torch.randn(12, 252, generator=torch.Generator().manual_seed(0))

@@ -63,7 +63,6 @@ def test_a_package_is_used_where_somebody_names_it(on_path: Path, how: str, monk
 
 
 def test_keys_of_a_custom_component_are_checked(on_path: Path):
-    """Nothing is there of a package that nobody names."""
     for words, line in (
         (["memory=mean"], "memory=mean: no such option"),
         (["evaluation.metrics=[FootSkate]"], "evaluation.metrics="),
@@ -278,7 +277,6 @@ def test_a_record_cannot_reach_beyond_the_package(on_path: Path):
 
 
 def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
-    """As in tables of a sweep that was planned before."""
     write(folder, {"mine.py": "A = 1\n"})
     plugins.activate(["mine"])
     run = Run(folder / "run")
@@ -292,7 +290,6 @@ def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
 
 
 def test_names_choose_a_grouping(tmp_path: Path):
-    """One that is suggested replaces the default."""
     assert choose_grouping(["ann/walk", "dataset-1_walk_active_001"]) == "bandai_namco"
     assert choose_grouping(["ann/walk"]) is None
     assert choose_grouping(["salsa/01", "salsa/16"]) is None  # of the default

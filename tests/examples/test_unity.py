@@ -181,7 +181,6 @@ def test_calibration_is_that_of_the_stream(play: Player, stream: Stream):
 
 
 def test_calibration_of_arms_that_hang_is_refused(play: Player, stream: Stream):
-    """The stream refuses it, too; the earlier calibration stays."""
     hanging = np.array([[0, 1.6, 0, 0, 0, 0, 1], [-0.25, 0.8, 0, 0, 0, 0, 1], [0.25, 0.8, 0, 0, 0, 0, 1]])
     with pytest.raises(InputError, match="from where a T-pose has it"):
         stream.calibrate(*((device[:3], device[3:]) for device in hanging))

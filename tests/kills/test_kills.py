@@ -36,7 +36,6 @@ MOMENTS = {
 
 @pytest.mark.slow
 def test_a_killed_training_resumes_to_the_same_model(tmp_path: Path):
-    """The command is killed at each moment in turn, and then runs to its end."""
     words = ["train", *BRIEF, "optim.steps=40", "optim.checkpoint_every=5", "export.graph=off"]
     disturbed, whole = tmp_path / "disturbed", tmp_path / "whole"
     for folder in (disturbed, whole):
@@ -67,7 +66,6 @@ def fork_controllers(folder: Path, monkeypatch: pytest.MonkeyPatch, *workers: st
 
 @pytest.mark.slow
 def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Controllers do the work of their workers."""
     fork_controllers(tmp_path, monkeypatch, "executor=debug")
     assert chaos.sweep_storm(2, 2, 2, random.Random(0), [*SMALL, *QUICK]) == []
 

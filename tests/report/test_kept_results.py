@@ -21,7 +21,6 @@ from memmlp.sweep.definition import Sweep
 
 
 def test_kept_results_make_the_runs_table(sweep: Sweep, kept: KeptResults, tmp_path: Path):
-    """The table is the same to six digits, with every origin and every group."""
     save_results(tmp_path / "kept.json", kept)
     read = load_kept_results(tmp_path / "kept.json")
     assert (read.sweep, read.overrides, read.command) == (

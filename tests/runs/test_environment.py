@@ -51,7 +51,6 @@ def test_a_file_is_parsed_only_if_its_bytes_differ(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """So it goes with the commit and the digests, which are taken once, too."""
     for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "first"]):
         (tmp_path / "__init__.py").write_text("A = 1\n")
         author = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
@@ -121,7 +120,6 @@ def test_a_training_that_is_resumed_upon_other_weights_has_both(tmp_path: Path):
 
 
 def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its weights come from both machines and both versions of the code."""
     run = Run.from_id(tmp_path, "0" * 16)
 
     def begin(device: str, commit: str, dirty: bool, losses: str) -> dict:

@@ -12,7 +12,6 @@ from memmlp.runs.run import Run
 
 
 def test_runs_are_found_by_the_beginning_of_their_id(tmp_path: Path):
-    """The newest is first."""
     runs = [begun(tmp_path, CONFIG | {"seed": seed}) for seed in range(10)]
     for seed, run in enumerate(runs):
         run.write_manifest({"started": f"202{seed}"})

@@ -86,7 +86,6 @@ INTEGERS = {"median_ms": 1.0, "onnx_bytes": 15, "int8": {"median_ms": 0.4, "onnx
 
 @pytest.mark.parametrize("graph", ["auto", "off"])
 def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, graph: str):
-    """Whatever else was exported since: another graph, another precision."""
     run = begun(tmp_path, CONFIG | {"export": {"graph": graph, "precision": "fp32"}})
     deploy(run, "2026-01-01", {"median_ms": 1.0, "onnx_bytes": 15})
     deploy(run, "2026-01-02", INTEGERS, precision="int8")
@@ -100,7 +99,6 @@ def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, gr
 
 
 def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What is shown and deployed of a run, where some is of an older recipe, be it the later."""
     run, versions = begun(tmp_path), memmlp.runs.identity.VERSIONS
     int8, fp32 = (
         {"export": {"graph": "naive", "precision": one}, "evaluation": {}} for one in ("int8", "fp32")

@@ -42,7 +42,6 @@ def test_variants_differ():
 
 
 def test_tables_carry_their_number_and_the_printed_values():
-    """Each row has the printed values, and none beside them."""
     for path in TABLES:
         sweep = load_sweep(path)
         assert path.stem == f"table{sweep.table:02}"

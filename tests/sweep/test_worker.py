@@ -170,7 +170,6 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
 
 @pytest.mark.parametrize("where", [lambda monkeypatch: None, apart])
 def test_workers_do_each_task_once_where_locks_do_nothing(tmp_path: Path, monkeypatch, where: Callable):
-    """On one machine, and on several that share the folder."""
     where(monkeypatch)
     monkeypatch.setattr(worker, "PAUSE", 0.001)
     tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(6)]

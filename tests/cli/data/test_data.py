@@ -41,7 +41,6 @@ def test_a_sheet_is_written_and_bad_files_are_named(tmp_path: Path):
 
 
 def test_a_cache_has_the_clips_of_training(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """For the same overrides; without data= they are those of data=mocap."""
     (tmp_path / "clips").mkdir()
     monkeypatch.chdir(tmp_path)
     found: list[ClipFolder] = []

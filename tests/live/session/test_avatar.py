@@ -2,7 +2,7 @@
 
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -30,16 +30,6 @@ def pose(size: float) -> BodyFrame:
     local[0] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ local[0]
     body = BodyTree(JOINTS, PARENTS, REST).compute_positions(local)
     return body_frame(0.0, local, size * (body + np.array([0.5, -0.25, 1.6])), size * REST)
-
-
-def edited(vrm: bytes, edit: Callable[[dict[str, Any]], None]) -> bytes:
-    (size,) = struct.unpack_from("<I", vrm, 12)
-    content = json.loads(vrm[20 : 20 + size])
-    edit(content)
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    rest = vrm[20 + size :]
-    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
 
 
 def without_chest(content: dict[str, Any]) -> None:
@@ -84,17 +74,19 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("edit", "size"),
-    [(None, 1.0), (without_chest, 1.2), (of_vrm_0, 1.2)],
-    ids=["own", "without chest", "VRM 0"],
-)
+@pytest.mark.parametrize(("edit", "size"), [(lambda _: None, 1.0), (without_chest, 1.2), (of_vrm_0, 1.2)])
 def test_an_avatar_s_bones_are_where_the_joints_are(browser, own: bytes, clip, edit, size: float):
     """Within what whole millimetres leave; of a wearer of another size, too.
 
     An avatar that lacks bones stands otherwise, but all its bones have the right direction.
     """
-    files = load_page_files(edited(own, edit) if edit else own)
+    (size_of_json,) = struct.unpack_from("<I", own, 12)
+    content, rest = json.loads(own[20 : 20 + size_of_json]), own[20 + size_of_json :]
+    edit(content)
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON")
+    files = load_page_files(head + text + rest)
     person = pose(size)
     words = make_greeting(ClipSource(clip, 60), "tiny", avatar=True)["avatar"]
     given = make_avatar_message(person)

@@ -6,6 +6,7 @@ import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from processes import PATIENCE
@@ -98,35 +99,20 @@ def post(server: LiveServer, content: bytes, path: str = "/wearer", **headers: s
     return response.status, response.read().decode()
 
 
-@pytest.fixture
-def asked() -> list[object]:
-    return []
-
-
-@pytest.fixture
-def fitted(asked: list[object]) -> Iterator[LiveServer]:
-
-    def ask(fields: object) -> None:
-        if fields == "no":
-            raise InputError("no: not allowed")
-        asked.append(fields)
-
+def test_commands_of_the_page_arrive():
+    ask = Mock(side_effect=[None, InputError("no: not allowed")])
     with LiveServer(Hub({}), 0, take_command=ask) as server:
-        yield server
-
-
-def test_orders_of_the_page_arrive(fitted: LiveServer, asked: list[object]):
-    own = f"http://127.0.0.1:{fitted.server_port}"
-    assert post(fitted, b'{"action": "forget"}', Origin=own) == (200, "")
-    assert asked == [{"action": "forget"}]
-    assert post(fitted, b'"no"') == (400, "no: not allowed")
-    for content in (b"", b"nonsense", b"[" * 900, b'"' + 2000 * b"x" + b'"', b"\xff"):
-        assert post(fitted, content) == (400, "not JSON")
-    assert post(fitted, b"{}", "/other")[0] == 404
-    elsewhere = {"Origin": "http://elsewhere.example", "Host": "elsewhere.example"}
-    for name, value in {**elsewhere, "Sec_Fetch_Site": "cross-site"}.items():
-        assert post(fitted, b'{"action": "forget"}', **{name: value})[0] == 403, name
-    assert len(asked) == 1
+        command, own = {"action": "forget"}, f"http://127.0.0.1:{server.server_port}"
+        assert post(server, json.dumps(command).encode(), Origin=own) == (200, "")
+        ask.assert_called_once_with(command)
+        assert post(server, b'"no"') == (400, "no: not allowed")
+        for content in (b"", b"nonsense", b"[" * 900, b'"' + 2000 * b"x" + b'"', b"\xff"):
+            assert post(server, content) == (400, "not JSON")
+        assert post(server, b"{}", "/other")[0] == 404
+        elsewhere = {"Origin": "http://elsewhere.example", "Host": "elsewhere.example"}
+        for name, value in {**elsewhere, "Sec_Fetch_Site": "cross-site"}.items():
+            assert post(server, b"{}", **{name: value})[0] == 403, name
+    assert ask.call_count == 2
 
 
 def test_at_another_address_everything_needs_the_token(clip: TrackedClip):

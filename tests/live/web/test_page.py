@@ -88,7 +88,6 @@ class Server(ThreadingHTTPServer):
 
 
 def test_it_is_worn_and_played_without_the_server(site: Made):
-    """In one browser, whose start and first load take seconds."""
     (script,) = package_files(IWER, "build/iwer.min.js")
     with Browser(160, 120) as browser:
         browser.before(script.decode() + HEADSET.read_text())

@@ -15,15 +15,9 @@ from memmlp.motion.importing.skeleton_map import find_skeleton
 from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT, write_skeleton_picture
 
 
-def columns(picture: np.ndarray, colour: str) -> np.ndarray:
-    rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-    return np.nonzero((picture == rgb).all(-1))[1]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("far", [False, True])
 def test_sides_are_on_their_sides(tmp_path: Path, far: bool):
-    """The view does not cover unmapped nodes far away."""
     bvh = read_bvh(write(tmp_path, walking("mixamo").text()))
     stance = view_stance(bvh, find_skeleton(bvh), make_builtin_rest_joints())
     if far:
@@ -32,6 +26,7 @@ def test_sides_are_on_their_sides(tmp_path: Path, far: bool):
     picture = np.asarray(Image.open(tmp_path / "out.png").convert("RGB"))
     width = picture.shape[1] // 5
     front, body = picture[:, width : 2 * width], picture[60:-60, 3 * width :]
-    right, left, middle = (np.median(columns(front, colour)) for colour in (RIGHT, LEFT, MIDDLE))
+    colours = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in (RIGHT, LEFT, MIDDLE)]
+    right, left, middle = (np.median(np.nonzero((front == rgb).all(-1))[1]) for rgb in colours)
     assert right + 5 < middle < left - 5
     assert 0.05 < (body.max(-1) < 200).mean() < 0.5

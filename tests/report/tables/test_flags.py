@@ -298,7 +298,6 @@ def test_seeds_upon_other_weights_of_one_prerequisite(sweep: Sweep, tmp_path: Pa
 
 
 def test_runs_from_before_code_changed(flags: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch):
-    """Files of memmlp and of users' packages."""
     now = {"training/loop.py": "1", "ik.py": "1", "new.py": "1", "mine:mine.py": "2"}
     monkeypatch.setattr("memmlp.report.tables.flags.compute_code_digests", lambda packages: now)
     code = {"training/loop.py": "1", "ik.py": "1", "gone.py": "0"}
@@ -418,7 +417,6 @@ def test_the_built_in_body_beside_smplh_numbers(
 def test_warnings_about_the_data(
     flags: Callable[..., list[str]], sweep: Sweep, tmp_path: Path, fact: str, ending: str
 ):
-    """Kept results know them, too."""
     origin = {"origin": {fact: "a warning"}}
     found = flags("a warning", lambda label, _: origin if label != LABELS[0] else {})
     assert found == [f"a warning{ending}: 'by position', 'full_model'"]

@@ -130,7 +130,6 @@ SOURCES = {clip: clip.split("/")[0] for clip in CLIPS}
 
 
 def test_means_of_one_sources_clips(tmp_path):
-    """Kept results have them, too."""
     run = fake_run(tmp_path, "a")
     for path in run.evaluations.glob("*.json"):
         report = read_json(path)

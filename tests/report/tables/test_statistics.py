@@ -43,7 +43,6 @@ def test_two_by_two_by_hand():
 
 
 def test_clips_or_seeds_that_do_not_differ_leave_students_test_of_the_others():
-    """That of clips has fewer degrees of freedom."""
     sample = np.random.default_rng(2).normal(1, 1, 12)
     effects = estimate_paired_effects(np.repeat(sample[None, :6, None], 9, 2))
     expected = stats.ttest_1samp(sample[:6], 0)

@@ -16,7 +16,6 @@ from memmlp.sweep.sweep_file import load_sweep
 
 
 def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
-    """The fake variants take 0.8, 0.88 and 0.96 ms, the paper's 6.0 and 30.1 ms."""
     sweep = load_sweep(SHIPPED / "table17.yaml")
     table = table_of(sweep, fake_sweep(tmp_path, sweep))
     ms = [row.cells[table.modes[0]]["ms"].mean for row in table.rows]

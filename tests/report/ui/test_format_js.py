@@ -30,7 +30,6 @@ def test_nan_errors_come_first_and_are_shown():
 
 
 def test_an_error_below_a_tenth_has_two_digits_as_its_difference_has():
-    """Such as one in metres, of a metric of one's own; as in tables."""
     assert js("[0.0034, 0.05, 3.1e-5, 0, 0.25].map(value => f.metricNumber('slide', value))") == [
         "0.0034", "0.050", "3.10e-5".replace("-", "\N{MINUS SIGN}"), "0.00", "0.25",
     ]  # fmt: skip

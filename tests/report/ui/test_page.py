@@ -150,7 +150,6 @@ def scored(run: Run, **values: float) -> None:
 
 
 def test_units_and_directions_of_custom_metrics(browser, tmp_path: Path, monkeypatch):
-    """Those of a package in use; of another metric nobody knows what is better."""
     monkeypatch.setitem(UNITS, "Score", "points")
     monkeypatch.setattr("memmlp.report.tables.table_text.HIGHER", {"Score"})
     make_outputs(tmp_path)
@@ -181,7 +180,6 @@ def test_units_and_directions_of_custom_metrics(browser, tmp_path: Path, monkeyp
 
 
 def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, tmp_path: Path):
-    """Its means are over other test clips."""
     make_outputs(tmp_path)
     gru, none = (run_of(tmp_path, variant, 0) for variant in ("gru", "none"))
     small = "[...document.querySelectorAll('.grid td.n > small')].length"

@@ -11,7 +11,6 @@ from memmlp.report.ui.run_index import RunIndex, read_facts, read_recent_entries
 
 
 def test_facts_of_a_finished_run(outputs: Path):
-    """Its times are those of the file that was asked for."""
     run = run_of(outputs, "gru", 1)
     (run.folder / "notes.json").write_text(json.dumps({"tags": ["good", 7], "note": "<b>look</b>"}))
     found = read_facts(run.folder)

@@ -18,7 +18,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_pruned_trial_has_no_value(folder: Path):
-    """That of its last step stood among those of trained networks."""
     study = with_a_pruned_trial(folder)
     write_json(folder / "search.json", asdict(study.search))
     first, second, *_ = Searches(folder.parents[1]).describe("mine")["trials"]

@@ -99,7 +99,6 @@ def test_bad_questions_and_bugs_are_answers(server: RunsServer, outputs: Path, m
 
 
 def test_the_page_s_files_and_their_policy(server: RunsServer, outputs: Path):
-    """A run's file is text without any right."""
     for name in page_files.FILES:
         answer = get(server, f"/{name}")
         assert (answer.code, len(answer.body) > 100) == (200, True)

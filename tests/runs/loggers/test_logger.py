@@ -124,7 +124,6 @@ def test_a_sync_leaves_runs_in_progress_and_tells_what_fails(tmp_path: Path):
 
 
 def test_status_is_that_of_the_folder(tmp_path: Path):
-    """A trained run without what was asked for is not done."""
     run = a_run(tmp_path)
     assert read_run_facts(run, running=True).status == "running"
     assert (read_run_facts(run).status, read_run_facts(run).ended) == ("killed", run.metrics()[-1].time)
@@ -169,7 +168,6 @@ def test_results_by_an_earlier_recipe_are_told(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_tail_reads_the_last_of_repeated_steps_and_then_what_follows(tmp_path: Path):
-    """It reads a line when it is whole."""
     run = a_run(tmp_path)
     run.log(3, {"loss": 9.0})
     tail = LogReader(run)

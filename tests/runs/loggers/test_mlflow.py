@@ -90,7 +90,6 @@ def test_a_run_from_its_start_to_its_end(store: Path, tmp_path: Path, capfd: pyt
 
 
 def test_what_changed_replaces_the_run(store: Path, tmp_path: Path):
-    """MLflow can't take a value back."""
     logger, run = MLflow(None, store), a_run(tmp_path)
     add_tags(run, ["good"])
     set_note(run, "a note")

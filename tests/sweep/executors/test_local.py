@@ -35,7 +35,6 @@ def test_a_worker_imports_the_package_that_starts_it(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("around", [contextlib.nullcontext, ignoring_interrupts])
 def test_a_cancelled_local_worker_ends(tmp_path: Path, around):
-    """Also where interrupts are ignored."""
     with around():
         (handle,) = LocalExecutor(tmp_path / "%j").submit(partial(time.sleep, 6000))
     assert handle.alive()
