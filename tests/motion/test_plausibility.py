@@ -91,26 +91,20 @@ def test_jumps_cuts_and_a_frozen_translation_are_reported():
         assert "trans is constant" not in faults(still)
 
 
-def test_held_poses_and_swapped_sides_are_reported():
-    """T-poses for calibration, and files that have lost all rotations but the root's."""
+def test_held_poses_swapped_sides_and_mirrored_axes_are_reported():
+    """T-poses for calibration, and files that have lost all rotations but the root's; elbows and knees that
+    bend backwards. A true mirror image is a person's motion."""
     clip = motion("walking")
     for first in (1, 0):
         poses = np.concatenate([clip.poses[:, :first], np.repeat(clip.poses[:1, first:], len(clip), 0)], 1)
         assert explain_implausibility(replace(clip, poses=poses)) is None
         assert faults(replace(clip, poses=poses)).startswith("only the root turns")
-    clip = motion("walking")
-    poses = clip.poses[:, OTHER_SIDE]
-    assert faults(replace(clip, poses=poses)).startswith("the elbows bend backwards")
-    assert faults(replace(clip, poses=poses * [1, -1, -1], trans=clip.trans * [-1, 1, 1])) == ""
-
-
-@pytest.mark.parametrize(
-    ("signs", "joints"), [((1, -1, -1), "elbows"), ((-1, 1, -1), "knees"), ((-1, -1, 1), "knees")]
-)
-def test_a_mirrored_axis_is_reported(signs, joints):
-    clip = motion("walking")
-    poses = np.concatenate([clip.poses[:, :1], clip.poses[:, 1:] * np.array(signs)], 1)
-    assert faults(replace(clip, poses=poses)).startswith(f"the {joints} bend backwards")
+    swapped = clip.poses[:, OTHER_SIDE]
+    assert faults(replace(clip, poses=swapped)).startswith("the elbows bend backwards")
+    assert faults(replace(clip, poses=swapped * [1, -1, -1], trans=clip.trans * [-1, 1, 1])) == ""
+    for signs, joints in (((1, -1, -1), "elbows"), ((-1, 1, -1), "knees"), ((-1, -1, 1), "knees")):
+        poses = np.concatenate([clip.poses[:, :1], clip.poses[:, 1:] * np.array(signs)], 1)
+        assert faults(replace(clip, poses=poses)).startswith(f"the {joints} bend backwards")
 
 
 @pytest.mark.parametrize(("trans", "z"), [
