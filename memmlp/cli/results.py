@@ -142,10 +142,11 @@ def docs(folder: Path, check: bool) -> None:
     template becomes a page with numbers and verdicts from these tables.
     """
     from memmlp.common.files import atomic_write
-    from memmlp.report.result_pages import MARK, make_pages
+    from memmlp.report.result_pages import MARK, draw_pictures, make_pages
 
     templates = {path.name: path.read_text(encoding="utf-8") for path in (folder / "templates").glob("*.md")}
-    pages = make_pages(make_tables(folder), templates)
+    tables = make_tables(folder)
+    pages = make_pages(tables, templates)
     present = {path.name: path.read_bytes().decode("utf-8", "replace") for path in folder.glob("*.md")}
     differing = [name for name, text in pages.items() if present.get(name) != text]
     stale = sorted(name for name, text in present.items() if text.startswith(MARK) and name not in pages)
@@ -160,6 +161,9 @@ def docs(folder: Path, check: bool) -> None:
     else:
         for name in differing:
             atomic_write(folder / name, pages[name])
+        for name, picture in draw_pictures(tables).items():  # its bytes differ between matplotlib's versions
+            if name.replace("_frontier.svg", ".md") in differing or not (folder / name).exists():
+                atomic_write(folder / name, picture)
         for name in stale:
             (folder / name).unlink()
     count = f"{len(pages)} page{'s' * (len(pages) != 1)}"

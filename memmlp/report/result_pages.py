@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 from memmlp.common.errors import InputError, import_optional
 from memmlp.report.kept_results import KeptResults
+from memmlp.report.pictures.frontier_picture import draw_frontiers
+from memmlp.report.tables.frontier import COST_HEADINGS, has_frontier
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Cell, Row, Table
@@ -23,6 +25,7 @@ from memmlp.report.tables.table_text import (
     format_counts,
     format_effect,
     format_number,
+    format_significant,
     format_value,
     make_caption,
     to_markdown,
@@ -65,13 +68,35 @@ def make_pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -
     pages = {}
     for name, source in sorted(sources.items()):
         tables = "\n".join(map(to_markdown, (source.table, *source.by_source)))
-        pages[f"{name}.md"] = f"{MARK}\n\n{tables}\n{describe_origin(source.kept)}\n"
+        frontier = _describe_frontier(name, source.table) if has_frontier(source.table) else ""
+        pages[f"{name}.md"] = f"{MARK}\n\n{tables}\n{frontier}{describe_origin(source.kept)}\n"
     for name in sorted(pages.keys() & templates.keys()):
         raise InputError(f"{name}: a template and a table's page have the same name; rename one of them")
     placeholders = Placeholders(sources).collect_functions()
     return pages | {
         name: _fill_template(name, text, placeholders) for name, text in sorted(templates.items())
     }
+
+
+def draw_pictures(sources: Mapping[str, KeptTable]) -> dict[str, bytes]:
+    """Return the pictures of all pages by file name: frontiers, where the training compute differs."""
+    tables = {name: source.table for name, source in sources.items() if has_frontier(source.table)}
+    return {f"{name}_frontier.svg": draw_frontiers(table) for name, table in tables.items()}
+
+
+def _describe_frontier(name: str, table: Table) -> str:
+    """Return the picture of error against compute and latency, and a table of costs."""
+    rows = [
+        [
+            row.label,
+            *(format_significant(row.costs[c], 3) if c in row.costs else MISSING for c in COST_HEADINGS),
+        ]
+        for row in table.rows
+        if row.found
+    ]
+    costs = _make_markdown_table(["variant", *COST_HEADINGS.values()], rows)
+    text = "Error against training compute and live latency, with 95 % intervals over seeds and clip groups:"
+    return f"{text}\n\n![Error against compute and latency]({name}_frontier.svg)\n\n{costs}\n\n"
 
 
 def _fill_template(name: str, text: str, placeholders: Mapping[str, object]) -> str:

@@ -106,7 +106,7 @@ def simulate(groups: int, seeds: int, tables: int, seed: int) -> dict[str, list[
 def find_broken(errors: dict[str, list[float]], tables: int) -> bool:
     """Return whether t, or flips of symmetric differences, exceed MOST by over two standard errors."""
     limit = MOST + 2 * np.sqrt(MOST * (1 - MOST) / tables)
-    return max(*errors["t"], *errors["flips"]) > limit
+    return bool(max(*errors["t"], *errors["flips"]) > limit)
 
 
 def make_row(groups: int, seeds: int, errors: dict[str, list[float]]) -> str:

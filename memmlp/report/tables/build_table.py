@@ -6,6 +6,7 @@ made the run.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from memmlp.report.tables.effects import (
     RunsBySeed,
     compare_branches,
     compute_effects,
+    estimate_mean_interval,
     find_control,
     find_paper_effect,
     use_existing_branches,
@@ -138,14 +140,15 @@ def _make_row(
         numbers = {seed: run.get_value(mode, variant.branch, metric) for seed, run in counted.items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}
         effect = effects.get(Key(variant.label, mode, metric))
-        clips = [run.count_clips(mode, variant.branch, metric) for run in counted.values()]
-        return Cell(
-            values,
-            (variant.paper or {}).get(metric),
-            effect,
-            find_paper_effect(sweep, variant, metric),
-            *(min(clips, default=(0, 0)) if values and metric not in COSTS else ()),
+        cell = Cell(
+            values, (variant.paper or {}).get(metric), effect, find_paper_effect(sweep, variant, metric)
         )
+        if not values or metric in COSTS:
+            return cell
+        measured = [counted[seed] for seed in values]
+        counted_clips, clips = min(run.count_clips(mode, variant.branch, metric) for run in measured)
+        low, high = estimate_mean_interval(measured, mode, variant.branch, metric)
+        return replace(cell, counted=counted_clips, clips=clips, low=low, high=high)
 
     control = find_control(sweep, variant)
     pairing = ""
@@ -161,7 +164,19 @@ def _make_row(
         cells={mode: {metric: make_cell(mode, metric) for metric in sweep.metrics} for mode in modes},
         pairing=pairing,
         confounded=variant.confounded,
+        series=variant.series or variant.label,
+        costs=_average_costs(runs or {}),
+        groups=max(
+            (len({run.get_group(clip) for clip in run.clips}) for run in (runs or {}).values()), default=0
+        ),
     )
+
+
+def _average_costs(runs: RunsBySeed) -> dict[str, float]:
+    """Return the means of costs and training costs that all runs have."""
+    found = [{**run.training, **run.costs} for run in runs.values()]
+    names = [name for name in (*COSTS, "tflop", "seconds") if found and all(name in one for one in found)]
+    return {name: math.fsum(one[name] for one in found) / len(found) for name in names}
 
 
 def _add_branches(

@@ -20,6 +20,7 @@ from memmlp.report.tables.statistics import (
     correct_by_holm,
     count_needed_seeds,
     decide_verdict,
+    estimate_interval,
     estimate_paired_effects,
 )
 from memmlp.report.tables.table import MAX_TIME_RATIO, Effect, Key
@@ -238,6 +239,25 @@ def estimate_effects(
             known: dict[str, Any] = {name: convert_nan_to_none(number) for name, number in values.items()}
             found[key] = Effect(float(mean), **known, **size)
     return {key: found[key] for key in pairs}
+
+
+def estimate_mean_interval(
+    runs: Sequence[MeasuredRun], mode: str, branch: str, metric: str
+) -> tuple[float | None, float | None]:
+    """Return the 95 % interval of a metric's mean over seeds and clip groups, from the runs of a variant.
+
+    It is None with a single seed and group, or if the runs differ in their clips with a value.
+    """
+    clips = list(runs[0].clips)
+    if any(run.clips.keys() != runs[0].clips.keys() for run in runs):
+        return None, None
+    values = np.array([run.get_clip_values(clips, mode, branch, metric) for run in runs])
+    known = np.isfinite(values[0])
+    if not known.any() or (np.isfinite(values) != known).any():
+        return None, None
+    groups = [runs[0].get_group(clip) for clip in itertools.compress(clips, known)]
+    low, high = estimate_interval(values[None][:, :, known], groups)
+    return convert_nan_to_none(low[0]), convert_nan_to_none(high[0])
 
 
 def count_testable(pairs: Mapping[Key, PairedDifferences]) -> int:

@@ -205,9 +205,19 @@ def estimate_paired_effects(differences: np.ndarray, groups: Groups = None) -> E
     """
     mean, known = differences.mean((1, 2)), estimate_error(differences, groups)
     nothing = np.full_like(mean, np.nan)
-    half = nothing if known.unreplicated == "seeds and clips" else known.compute_half_width(LEVEL)
     p = nothing if known.unreplicated else known.compute_significance_level(np.abs(mean))
-    return EffectEstimates(mean, mean - half, mean + half, p, known.unreplicated)
+    return EffectEstimates(mean, *estimate_interval(differences, groups), p, known.unreplicated)
+
+
+def estimate_interval(values: np.ndarray, groups: Groups = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the limits (K,) of the 95 % intervals of means, from values (K, S, C) and groups (C,).
+
+    They are NaN with a single seed and a single group.
+    """
+    mean, known = values.mean((1, 2)), estimate_error(values, groups)
+    undefined = known.unreplicated == "seeds and clips"
+    half = np.full_like(mean, np.nan) if undefined else known.compute_half_width(LEVEL)
+    return mean - half, mean + half
 
 
 def estimate_seed_effects(differences: np.ndarray) -> EffectEstimates:

@@ -81,6 +81,7 @@ class Cell:
         effect: the measured difference from the control.
         paper_effect: the paper's difference from the control.
         counted, clips: the number of clips with a value, the smallest over seeds, and of all clips.
+        low, high: the 95 % interval of the mean over seeds and clip groups; None if undefined.
     """
 
     values: Mapping[int, float]
@@ -89,6 +90,8 @@ class Cell:
     paper_effect: float | None = None
     counted: int = 0
     clips: int = 0
+    low: float | None = None
+    high: float | None = None
 
     @property
     def mean(self) -> float | None:
@@ -134,6 +137,9 @@ class Row:
             metric. Each branch has its own correction, and the verdict refers to the paper's effect.
         unrecorded: the branches that the runs of variant or control lack.
         confounded: the differences from the control that the label does not name; None without any.
+        series: the label without the overrides of the axes.
+        costs: means of the known costs over seeds: COSTS, and `tflop` and `seconds` of the training.
+        groups: the number of groups of test clips.
     """
 
     label: str
@@ -147,6 +153,9 @@ class Row:
     branches: Mapping[str, Mapping[str, Mapping[str, Effect]]] = field(default_factory=dict)
     unrecorded: tuple[str, ...] = ()
     confounded: str | None = None
+    series: str = ""
+    costs: Mapping[str, float] = field(default_factory=dict)
+    groups: int = 0
 
     @property
     def is_paper_only(self) -> bool:

@@ -105,7 +105,7 @@ def make_legend(table: Table) -> list[str]:
     if not any(row.found for row in table.rows):
         return lines
     if table.measured_metrics:
-        lines.append("mean ± sd over seeds of the means over test clips")
+        lines.append(f"mean ± sd over seeds of the means over test clips{_explain_intervals(table)}")
     if any(True for mode in table.modes for _ in table.list_effects(mode)):
         lines += [_explain_differences(table), _explain_verdicts(table)]
         if table.analyses:
@@ -158,6 +158,14 @@ def _explain_verdicts(table: Table) -> str:
         "higher or lower (significant, where the paper prints no difference), equivalent (nearer to 0 than "
         f"the smallest effect of interest: {', '.join(margins)}), inconclusive (none of these)"
     )
+
+
+def _explain_intervals(table: Table) -> str:
+    groups = sorted({row.groups for row in table.rows if row.groups})
+    if table.number or not groups:
+        return ""
+    number = f"{groups[0]}" if len(groups) == 1 else f"{groups[0]} to {groups[-1]}"
+    return f" [95 % interval over seeds and {number} groups of clips; with data=persons, groups are persons]"
 
 
 def _explain_branches(table: Table) -> list[str]:
@@ -242,7 +250,7 @@ def _make_lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
     if row.is_paper_only:
         yield ((row.label,), ("paper",), *paper)
         return
-    values = ((format_value(cell, metric),) for cell, metric in cells)
+    values = ((format_value(cell, metric), *_format_interval(table, cell)) for cell, metric in cells)
     label = f"{row.label} {CONFOUNDED}" if row.confounded else row.label
     yield ((label,), (f"{len(row.found)}/{len(row.wanted)}",), *values)
     if any(cell.effect for cell, _ in cells):
@@ -252,6 +260,14 @@ def _make_lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
         yield (("",), (branch,), *(format_branch_effect(effect, cell) for effect, cell in others))
     if any(cell.paper is not None for cell, _ in cells):
         yield (("",), ("paper",), *paper)
+
+
+def _format_interval(table: Table, cell: Cell) -> tuple[str, ...]:
+    """Return the interval of a mean, for tables of this project; the paper's tables are about differences."""
+    if table.number or cell.low is None or cell.high is None:
+        return ()
+    digits = count_interval_decimals(cell.high - cell.low)
+    return (f"[{format_signed(cell.low, f'.{digits}f')}, {format_signed(cell.high, f'.{digits}f')}]",)
 
 
 def format_value(cell: Cell, metric: str) -> str:

@@ -45,6 +45,20 @@ def test_correction_is_over_all_modes_and_metrics(table: Table):
     assert smallest.holm == pytest.approx(min(1, smallest.p * len(tested)))
 
 
+def test_a_mean_has_the_interval_of_its_errors(sweep: Sweep, tmp_path: Path):
+    groups = {clip: clip[:7] for clip in CLIPS}
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS, groups=groups))
+    found = cell(make_table(sweep, runs), "full_model", "MPJPE")
+    errors = [
+        run.get_clip_values(CLIPS, "stream", "rotation", "MPJPE") for run in runs["full_model"].values()
+    ]
+    expected = estimate_paired_effects(np.array([errors]), [groups[clip] for clip in CLIPS])
+    assert (found.low, found.high) == pytest.approx((expected.low[0], expected.high[0]))
+    assert found.low < found.mean < found.high
+    one = {label: dict(list(seeds.items())[:1]) for label, seeds in runs.items()}
+    assert cell(make_table(sweep, one), "full_model", "MPJPE").low is not None  # over clips alone
+
+
 def test_other_branches_have_the_effects_of_their_own_table(sweep: Sweep, tmp_path: Path):
     """Variant and control are in one branch, even if the row compares two branches."""
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS))

@@ -123,6 +123,27 @@ export function forest(rows, { label, smallest }) {
   return figure(`${label}, differences from the control. ${sentence}`, draw);
 }
 
+// Errors with their intervals against a cost on a logarithmic axis, one curve for each series.
+export function frontier(points, { x, y }) {
+  const colours = colourOf(new Set(points.map(point => point.series)));
+  const colour = point => colours.get(point.series);
+  const words = point => `${point.variant}: ${number(point.mean)} at ${number(Number(point.cost.toPrecision(3)))}`;
+  const last = [...colours.keys()].map(series => points.filter(point => point.series === series).at(-1));
+  const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.6, 240), 400), {
+    marginRight: Math.min(nameWidth([...colours.keys()]), width * 0.3),
+    x: { type: 'log', label: x, ticks: Math.min(width / 90, 6), tickFormat: '~g' },
+    y: { label: y, grid: true, nice: true, ticks: 5 },
+    marks: [
+      Plot.link(points.filter(point => point.low !== null), { x: 'cost', y1: 'low', y2: 'high', stroke: colour, strokeWidth: 1.5, strokeOpacity: 0.6 }),
+      Plot.line(points, { x: 'cost', y: 'mean', z: 'series', stroke: colour, strokeWidth: 2 }),
+      Plot.dot(points, { x: 'cost', y: 'mean', r: 4, fill: colour }),
+      Plot.text(last, { x: 'cost', y: 'mean', text: 'series', textAnchor: 'start', dx: 8, fill: colour }),
+      tip(points, { x: 'cost', y: 'mean', title: words }),
+    ],
+  }));
+  return figure(`${y} against ${x}. ${points.map(words).join('; ')}`, draw);
+}
+
 // Points { x, y, text, best } in two measures; a line joins the best ones. open(point): called by a click.
 export function scatter(points, { x, y, open }) {
   const best = points.filter(point => point.best).sort((a, b) => a.x - b.x);

@@ -3,7 +3,7 @@
 import { h, replace, link, section, empty, choice, table } from './dom.js';
 import { address, ask, generated, inFile, nameOf, place, remember, runs } from './store.js';
 import { curvePanel } from './curves.js';
-import { forest } from './charts.js';
+import { forest, frontier } from './charts.js';
 import { ACTIVE, look, state, STATE_WORDS } from './runs.js';
 import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
 
@@ -45,7 +45,7 @@ export async function single(name) {
   function draw() {
     replace(top, h('p', { class: 'trail' }, link('#/sweeps', 'Sweeps')), h('div', { class: 'bar title' }, h('h1', {}, sweep.table.caption)),
       sweep.name === sweep.table.caption ? null : h('p', { class: 'faint sub' }, sweep.name), sweep.counts.done === sweep.tasks ? null : progress(sweep), sweep.cells.length ? board(sweep) : null,
-      effects(sweep.table, draw), section('Table', results(sweep.table)), sweep.rounds ? rounds(sweep.rounds) : null);
+      effects(sweep.table, draw), frontiers(sweep.table), section('Table', results(sweep.table)), sweep.rounds ? rounds(sweep.rounds) : null);
   }
   async function update() {
     if (!inFile) sweep = await ask(`sweeps/${name}`);
@@ -122,6 +122,22 @@ function effects(found, draw, head = 'h2') {
   return h('section', {}, h(head, {}, 'Effects'),
     h('div', { class: 'tools' }, choice('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), found.modes.length > 1 ? choice('Mode', found.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
     h('p', { class: 'faint' }, note), forest(rows, { label: found.headings[metric].replace(/ ↓| ↑/, ''), smallest: found.smallest[metric] }));
+}
+
+// Error against training compute and live latency, where the training compute is known and differs.
+const COSTS = [['parameters', 'parameters [M]'], ['MACs', 'MACs [G]'], ['tflop', 'training [TFLOP]'], ['seconds', 'training [s]'], ['ms', 'step [ms]']];
+function frontiers(found) {
+  const known = found.rows.map(row => row.costs?.tflop).filter(value => value !== undefined);
+  if (known.length < 2 || Math.max(...known) <= 1.1 * Math.min(...known)) return null;
+  const mode = found.modes[0];
+  const metric = found.metrics.find(one => one === 'MPJPE') ?? found.metrics[0];
+  const points = cost => found.rows.filter(row => row.costs[cost] !== undefined && row.cells[mode][metric].mean !== null)
+    .map(row => ({ series: row.series, variant: row.label, cost: row.costs[cost], ...row.cells[mode][metric] })).sort((a, b) => a.cost - b.cost);
+  const chart = (cost, x) => frontier(points(cost), { x, y: found.headings[metric].replace(/ ↓| ↑/, '') });
+  const digits = value => (value === undefined ? DASH : number(Number(value.toPrecision(3))));
+  return section('Frontiers', h('p', { class: 'faint' }, 'Error with its 95 % interval over seeds and clip groups; one curve for each network.'),
+    h('div', { class: 'pair' }, chart('tflop', 'training compute [TFLOP]'), chart('ms', 'live latency of a step [ms]')),
+    table(['variant', ...COSTS.map(([, head]) => head)], found.rows.filter(row => row.found.length).map(row => [row.label, ...COSTS.map(([cost]) => digits(row.costs[cost]))])));
 }
 
 // Both corrected p-values, where sign flips were computed.

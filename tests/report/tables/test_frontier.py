@@ -1,0 +1,69 @@
+"""Frontiers are of the measured compute, latency and errors, and their pictures show every network."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_runs import fake_run, table_of
+
+from memmlp.report.kept_results import KeptResults
+from memmlp.report.pictures.frontier_picture import draw_frontiers
+from memmlp.report.result_pages import KeptTable, draw_pictures, make_pages
+from memmlp.report.tables.frontier import has_frontier, list_points
+from memmlp.report.tables.table import Table
+from memmlp.sweep.sweep_file import parse_sweep
+
+CONTENT = {
+    "seeds": [0, 1],
+    "metrics": ["MPJRE", "MPJPE"],
+    "variants": {"Mem-MLP": [], "RPM": ["model=rpm"], "VAE-HMD": ["model=vae_hmd"]},
+    "axes": {"optim.tflop": [5, 20]},
+}
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Table:
+    sweep = parse_sweep("budgets", CONTENT)
+    runs = {}
+    for number, variant in enumerate(sweep.variants):
+        budget = 5.0 if variant.cell == ("optim.tflop=5",) else 20.0
+        for seed in sweep.seeds:
+            origin = {"tflop": budget + 0.1 * seed}
+            runs[variant.label, seed] = fake_run(
+                tmp_path, variant.label, seed, 1 + 0.1 * number, origin=origin
+            )
+    return table_of(sweep, lambda variant, seed: runs[variant.label, seed])
+
+
+def test_points_are_the_cells_of_a_network_by_budget(table: Table):
+    assert has_frontier(table)
+    points = list(list_points(table, "tflop"))
+    assert [point.series for point in points] == ["Mem-MLP"] * 2 + ["RPM"] * 2 + ["VAE-HMD"] * 2
+    assert [point.cost for point in points] == pytest.approx([5.05, 20.05] * 3)
+    rows = {row.label: row for row in table.rows}
+    for point in points:
+        cell = rows[point.label].cells["stream"]["MPJPE"]
+        assert (point.mean, point.low, point.high) == (cell.mean, cell.low, cell.high)
+        assert point.low < point.mean < point.high
+    assert rows["RPM, optim.tflop=5"].costs["seconds"] == 300
+
+
+def test_one_budget_or_an_unknown_one_is_no_frontier(table: Table):
+    rows = tuple(replace(row, costs={**row.costs, "tflop": 5.0}) for row in table.rows)
+    assert not has_frontier(replace(table, rows=rows))
+    assert not has_frontier(replace(table, rows=tuple(replace(row, costs={}) for row in table.rows)))
+
+
+def test_the_page_has_a_picture_and_the_costs(table: Table):
+    """The picture is the same each time, with a line for each network."""
+    kept = KeptResults("budgets", (), {}, {})
+    sources = {"budgets": KeptTable(kept, table)}
+    page = make_pages(sources, {})["budgets.md"]
+    assert "(budgets_frontier.svg)" in page
+    assert "| RPM, optim.tflop=20 | 0.357 | 0.013 | 20.1 | 300 |" in page
+    (picture,) = draw_pictures(sources).values()
+    assert picture == draw_frontiers(table)
+    assert len(set(re.findall(rb"<!-- (Mem-MLP|RPM|VAE-HMD) -->", picture))) == 3
