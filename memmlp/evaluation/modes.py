@@ -36,6 +36,8 @@ from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 
+CHECKED_FRAMES = 8  # frames at the start of a stream that are computed both together and one by one
+
 
 def predict_stream(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
     """Predict the world motion (N, 198) of clips (N, 252) frame by frame."""
@@ -58,20 +60,36 @@ def predict_frame_by_frame(network: MotionModel, clips: Sequence[Tensor], size: 
     """Predict the motion (N, 198) of clips (N, 252). Each network call gets one new frame.
 
     The last call in each window of `size` frames gives the motion for the whole window. The last window of a
-    clip may be shorter. With `size` 1, this is a live stream.
+    clip may be shorter. With `size` 1, this is a live stream. It may have several frames in a call if that
+    gives the same motion (`MotionModel.frames_per_call`).
     """
     order, lengths, inputs = _sort_and_pad(clips)
+    step = count_frames_per_call(network, inputs) if size == 1 else 1
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
     active = len(clips)
-    for t in progress_bar(range(lengths[0]), "stream", unit="frames"):
+    for t in progress_bar(range(0, lengths[0], step), "stream", unit="calls"):
         while lengths[active - 1] <= t:  # the clips are sorted by length, so the last ones end first
             active -= 1
             state = {name: tensor[:active] for name, tensor in state.items()}
-        since = t - t % size
-        output, state = network.advance(inputs[:active, t : t + 1], state, t + 1 - since)
-        motion[:active, since : t + 1] = output[:, since - t - 1 :]  # overwrites earlier calls
+        since, end = t - t % size, min(t + step, lengths[0])
+        output, state = network.advance(inputs[:active, t:end], state, end - since)
+        motion[:active, since:end] = output[:, since - end :]  # overwrites earlier calls
     return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
+
+
+@torch.no_grad()
+def count_frames_per_call(network: MotionModel, inputs: Tensor) -> int:
+    """Return `network.frames_per_call`, or 1 if the first of inputs (B, N, 54) depend on later ones."""
+    if network.frames_per_call > 1:
+        state, begin = network.initial_state(len(inputs)), inputs[:, :CHECKED_FRAMES]
+        together, singly = network.advance(begin, state)[0], []
+        for frame in begin.split(1, 1):
+            motion, state = network.advance(frame, state, 1)
+            singly.append(motion)
+        if not torch.allclose(together, torch.cat(singly, 1), atol=1e-3):
+            return 1
+    return network.frames_per_call
 
 
 @torch.no_grad()

@@ -51,6 +51,8 @@ class MotionModel(nn.Module):
         settled: whether the recalled values of a past frame never change, so that a live stream may keep
             them.
         windowless: whether the network is a stream in both evaluation modes; see WindowlessModel.
+        frames_per_call: number of new frames per call of a stream's evaluation. More than 1 needs a network
+            whose motion is the same, up to rounding, for calls with one frame each.
         is_stream: whether the network runs without future frames. If not, only window mode can evaluate it.
         takes_whole_clip: whether window mode passes a whole clip to `predict_clip`, which may overlap
             windows.
@@ -60,6 +62,7 @@ class MotionModel(nn.Module):
     shift: int = 0
     settled: bool = True
     windowless: bool = False
+    frames_per_call: int = 1
     is_stream: bool = True
     takes_whole_clip: bool = False
     graph: ClassVar[type[StreamingGraph] | None] = None
@@ -152,6 +155,7 @@ class WindowlessModel(MotionModel):
     """
 
     windowless = True
+    frames_per_call = 256
 
     @property
     def past_frames(self) -> int:

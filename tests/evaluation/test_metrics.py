@@ -59,6 +59,7 @@ class Counter:
 
     shift, frames, calls, normalizer = 0, 7, 0, tiny.normalizer()
     windowless = takes_whole_clip = False
+    frames_per_call = 1
 
     def initial_state(self, batch=1):
         return {"motion": torch.zeros(batch, self.frames, MOTION_DIM)}

@@ -4,8 +4,14 @@ import pytest
 import tiny
 import torch
 
-from memmlp.evaluation.modes import predict_frame_by_frame, predict_stream, predict_windows
+from memmlp.evaluation.modes import (
+    count_frames_per_call,
+    predict_frame_by_frame,
+    predict_stream,
+    predict_windows,
+)
 from memmlp.networks.memory import GRUMemory, LSTMMemory
+from memmlp.networks.motion_model import WindowlessModel
 
 CLIPS = [tiny.clip(n, seed=n).double() for n in (25, 5, 20, 16)]  # windows of 7 or 8
 
@@ -25,3 +31,28 @@ def test_a_recurrent_memory_runs_over_each_frame_once(memory):
     expected = predict_frame_by_frame(model, CLIPS, model.frames)
     for windowed, one in zip(predict_windows(model, CLIPS), expected, strict=True):
         torch.testing.assert_close(windowed, one, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["hmd_poser", "rpm", "vae_hmd", "recurrent_poser"])
+@torch.no_grad()
+def test_several_frames_in_a_call_are_the_same_stream(name):
+    model = (tiny.recurrent_poser() if name == "recurrent_poser" else tiny.baseline(name)).double()
+    model.frames_per_call = 6
+    several = predict_stream(model, CLIPS)
+    model.frames_per_call = 1
+    for made, expected in zip(several, predict_stream(model, CLIPS), strict=True):
+        torch.testing.assert_close(made, expected, atol=1e-9, rtol=0)
+
+
+class SeesLaterFrames(WindowlessModel):
+    """A network that averages the frames of a call, so its results depend on the size of the calls."""
+
+    def advance(self, sparse, state, newest=None):
+        return sparse.mean(1, keepdim=True).repeat(1, sparse.shape[1], 4)[..., :198], state
+
+
+def test_a_network_that_would_see_later_frames_gets_one_frame_per_call():
+    model = SeesLaterFrames(tiny.normalizer(), 7)
+    assert count_frames_per_call(model, CLIPS[0][None, :, :54]) == 1
+    (motion,) = predict_stream(model, CLIPS[:1])
+    torch.testing.assert_close(motion[:, :54], CLIPS[0][:, :54])
