@@ -180,7 +180,7 @@ def assert_same(one: EffectEstimates, other: EffectEstimates) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(sizes)
 def test_order_and_names_do_not_matter(size: tuple[int, int, int]):
     seeds, clips, number = size
@@ -195,7 +195,7 @@ def test_order_and_names_do_not_matter(size: tuple[int, int, int]):
     assert_same(effects, EffectEstimates(*(np.concatenate([e[i] for e in alone]) for i in range(4)), ""))
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(sizes, st.floats(0.01, 100))
 def test_units_and_signs_do_not_matter(size: tuple[int, int, int], scale: float):
     seeds, clips, number = size
