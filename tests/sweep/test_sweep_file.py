@@ -98,7 +98,7 @@ VALUES = st.recursive(
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(st.dictionaries(KEYS, VALUES, max_size=6))
 def test_whatever_stands_in_it_is_a_sweep_or_one_line(content):
     try:

@@ -34,6 +34,11 @@ def rows(table: int) -> list[dict[str, Any]]:
     return [{key: value for key, value in row.items() if value is not None} for row in found]
 
 
+@functools.cache
+def compose_flat(*overrides: str) -> dict[str, Any]:
+    return flatten(OmegaConf.to_container(compose_config([*overrides]), resolve=True))
+
+
 def test_variants_differ():
     same = ("MANIKIN-LN",)  # its size is that of MANIKIN-L's network, as Table 16's note says
     for path in FILES:
@@ -73,14 +78,13 @@ def test_a_row_that_changes_more_than_its_label_names_is_confounded():
         if path.stem in OF_NETWORKS | {"mix"} or set(sweep.metrics) <= set(COSTS):
             continue
         sweep = replace(sweep, base=tuple(text for text in sweep.base if not text.startswith("data=")))
-        flat = functools.cache(
-            lambda overrides: flatten(OmegaConf.to_container(compose_config([*overrides]), resolve=True))
-        )
         variants = {variant.label: variant for variant in sweep.list_runnable()}
         for label, variant in variants.items():
             control = sweep.find_control(variant)
             if control and variants[control].cell == variant.cell:
-                one, other = (flat(sweep.merge_overrides(row)) for row in (variant, variants[control]))
+                one, other = (
+                    compose_flat(*sweep.merge_overrides(row)) for row in (variant, variants[control])
+                )
                 keys = {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}
                 changed = {key.split(".")[0] for key in keys} - {"evaluation", "seed"}
                 changed -= {"hand"} if "predictor" in changed and "model" not in changed else set()
@@ -93,10 +97,7 @@ def test_the_decomposition_changes_one_ingredient_a_step():
     """Each variant's config differs from its control's in what its label names, or only its branch does."""
     sweep = load_sweep(FOLDER / "decomposition.yaml")
     variants = {variant.label: variant for variant in sweep.variants}
-    composed = {
-        label: compose_config([*sweep.merge_overrides(variant)]) for label, variant in variants.items()
-    }
-    configs = {label: flatten(OmegaConf.to_container(cfg, resolve=True)) for label, cfg in composed.items()}
+    configs = {label: compose_flat(*sweep.merge_overrides(one)) for label, one in variants.items()}
     changed = {}
     for label, variant in variants.items():
         control = sweep.find_control(variant)
