@@ -14,6 +14,7 @@ from memmlp.report.tables.table_text import add_unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+SHIFT = 1.015  # ratio of neighbouring networks' places, so that intervals at one budget do not overlap
 LABELS = {COMPUTE: "training compute [TFLOP]", LATENCY: "live latency of a step [ms]"}
 
 
@@ -21,6 +22,7 @@ def draw_frontiers(table: Table) -> bytes:
     """Return a picture (SVG) of error against training compute and against latency, side by side."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     points = {cost: list(list_points(table, cost)) for cost in LABELS}
     names = sorted({point.series for found in points.values() for point in found})
@@ -29,8 +31,11 @@ def draw_frontiers(table: Table) -> bytes:
         first = None
         for number, (cost, found) in enumerate(points.items(), 1):
             first = axes = figure.add_subplot(1, 2, number, sharey=first)
-            _draw_curves(axes, found, names)
-            axes.set(xscale="log", xlabel=LABELS[cost], ylabel=add_unit(choose_metric(table)))
+            _draw_curves(axes, found, names, SHIFT if cost == COMPUTE else 1.0)
+            axes.set_xscale("log", subs=[])
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.set(xlabel=LABELS[cost], ylabel=add_unit(choose_metric(table)))
             axes.grid(alpha=0.25)
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
@@ -39,12 +44,13 @@ def draw_frontiers(table: Table) -> bytes:
     return picture.getvalue()
 
 
-def _draw_curves(axes: Axes, points: Sequence[Point], names: Sequence[str]) -> None:
+def _draw_curves(axes: Axes, points: Sequence[Point], names: Sequence[str], ratio: float) -> None:
+    """Draw a curve for each network; `ratio` is the distance between neighbouring networks at one cost."""
     for name, group in itertools.groupby(points, key=lambda point: point.series):
         own = list(group)
         sides = [[one.mean - one.low for one in own], [one.high - one.mean for one in own]]
-        colour = f"C{names.index(name) % 10}"
+        colour, shift = f"C{names.index(name) % 10}", ratio ** (names.index(name) - len(names) / 2)
         axes.errorbar(
-            [one.cost for one in own], [one.mean for one in own], sides, label=name, color=colour,
+            [shift * one.cost for one in own], [one.mean for one in own], sides, label=name, color=colour,
             marker="o", markersize=4, capsize=2, linewidth=1.4,
         )  # fmt: skip
