@@ -108,7 +108,7 @@ def inspect(path: Path) -> None:
     content = survey_folder(path)
     show_skipped(content.skipped)
     show_pairs("unusual", content.unusual, ": ")
-    show_pairs("some or all frames are the same", content.duplicates)
+    show_pairs("some or all of the motion is the same", content.duplicates)
     show_rates(content.clips)
     hours = Total(len(content.clips), sum(clip.length for clip in content.clips)).hours
     click.echo(f"{len(content.clips)} clips, {hours:.2f} h, {len(content.skipped)} bad files")

@@ -66,6 +66,14 @@ class Total(NamedTuple):
         return self.frames / FPS / 3600
 
 
+def name_copies(clips: Iterable[ClipRecord]) -> dict[str, str]:
+    """Return the clips with common motion: clip -> the first clip with it."""
+    firsts: dict[str, str] = {}
+    moving = [clip for clip in clips if clip.content != STILL]
+    pairs = {clip.name: firsts.setdefault(clip.content, clip.name) for clip in moving}
+    return {name: first for name, first in pairs.items() if name != first}
+
+
 @dataclass(frozen=True)
 class Coverage:
     """The numbers of a split's entries (list entries, subsets) with and without a clip.

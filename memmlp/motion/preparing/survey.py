@@ -25,7 +25,7 @@ from memmlp.motion.preparing.duplicates import (
     merge_contents,
 )
 from memmlp.motion.preparing.find_clips import Root, find_clips, get_clip_name
-from memmlp.motion.preparing.manifest import STILL, ClipRecord
+from memmlp.motion.preparing.manifest import STILL, ClipRecord, name_copies
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,7 @@ class Survey:
     @property
     def duplicates(self) -> dict[str, str]:
         """Clip -> the first clip with common motion."""
-        firsts: dict[str, str] = {}
-        moving = [clip for clip in self.clips if clip.content != STILL]
-        pairs = {clip.name: firsts.setdefault(clip.content, clip.name) for clip in moving}
-        return {name: first for name, first in pairs.items() if name != first}
+        return name_copies(self.clips)
 
 
 class TooShortError(InputError):
