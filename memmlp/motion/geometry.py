@@ -107,11 +107,12 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
         rest: rest positions (22, 3), metres; only the offsets between joint and parent matter.
     """
     offsets = (rest - rest[list(PARENTS)])[..., None]  # the root's offset is not used
-    rotations, positions = [local[..., :1, :, :]], [root[..., None, :, None]]
-    for joints, parents in LEVELS:
+    top, *levels = local.split([1, *(joints.stop - joints.start for joints, _ in LEVELS)], -3)
+    rotations, positions = [top], [root[..., None, :, None]]
+    for level, (joints, parents) in zip(levels, LEVELS, strict=True):
         above = _take_rows(rotations[-1], parents)
         positions.append(_take_rows(positions[-1], parents) + above @ offsets[joints])
-        rotations.append(above @ local[..., joints, :, :])
+        rotations.append(above @ level)
     return torch.cat(rotations, -3), torch.cat(positions, -3)[..., 0]
 
 

@@ -39,7 +39,9 @@ SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     "milestones": lambda done, final, drop_at: 0.2 ** sum(done >= at for at in (0.2, 0.5, 0.7)),
 }
 
-MATRIX_PRODUCTS = {torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__, torch.mm, torch.addmm}
+MATRIX_PRODUCTS = {
+    torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__, torch.mm, torch.addmm, torch.baddbmm
+}  # fmt: skip
 """The matrix products that are computed in float32 where bfloat16 is slow."""
 
 
@@ -216,8 +218,8 @@ class Muon(Optim):
     """Optimisation by Muon for matrices, and by AdamW for all other parameters (Jordan et al. 2024).
 
     Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025). AdamW's learning rates
-    and weight decay therefore suit both. The implementation is torch.optim.Muon, which multiplies matrices in
-    bfloat16 and uses Nesterov momentum. The attributes are the keys of MuonSettings.
+    and weight decay therefore suit both. Like torch.optim.Muon, it multiplies matrices in bfloat16 and uses
+    Nesterov momentum. The attributes are the keys of MuonSettings.
     """
 
     momentum: float = 0.95
@@ -243,7 +245,7 @@ class Muon(Optim):
         parts: list[Optimizer] = []
         if matrices:
             keys = self.lr, self.weight_decay, self.momentum
-            parts.append(torch.optim.Muon(matrices, *keys, adjust_lr_fn="match_rms_adamw"))
+            parts.append(BatchedMuon(matrices, *keys, adjust_lr_fn="match_rms_adamw"))
         if rest:
             parts.append(replace(self, lr=self.other_lr or self.lr, decoupled=True).build_adam(rest))
         return ComposedOptimiser(parts)
@@ -300,6 +302,46 @@ def make_vqvae_optim(steps: int, **keys: Any) -> Optim:
     return Optim(
         steps, schedule="milestones", betas=(0.9, 0.99), decoupled=False, validate_every=steps, **keys
     )
+
+
+class BatchedMuon(getattr(torch.optim, "Muon", Optimizer)):  # type: ignore[misc]
+    """torch.optim.Muon with matrices of one shape in one batch: equal, in half the time on a CPU."""
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> None:
+        """Take a step; a closure is not supported."""
+        for group in self.param_groups:
+            parameters = [one for one in group["params"] if one.grad is not None]
+            grads = [one.grad for one in parameters]
+            for one in parameters:
+                if not self.state[one]:
+                    self.state[one]["momentum_buffer"] = torch.zeros_like(one)
+            buffers = [self.state[one]["momentum_buffer"] for one in parameters]
+            torch._foreach_lerp_(buffers, grads, 1 - group["momentum"])
+            updates = torch._foreach_lerp(grads, buffers, group["momentum"])
+            torch._foreach_mul_(parameters, 1 - group["lr"] * group["weight_decay"])
+            for shape in {one.shape for one in parameters}:
+                own = [index for index, one in enumerate(parameters) if one.shape == shape]
+                made = orthogonalise(torch.stack([updates[index] for index in own]), group)
+                for index, update in zip(own, made, strict=True):
+                    parameters[index].add_(update, alpha=-group["lr"] * 0.2 * math.sqrt(max(shape)))
+
+
+def orthogonalise(matrices: Tensor, group: Mapping[str, Any]) -> Tensor:
+    """Return nearly orthogonal matrices (B, m, n), bfloat16, by torch.optim.Muon's Newton-Schulz iteration.
+
+    Args:
+        matrices: the matrices (B, m, n).
+        group: a parameter group of torch.optim.Muon, with the iteration's settings.
+    """
+    a, b, c = group["ns_coefficients"]
+    tall = matrices.shape[1] > matrices.shape[2]
+    x = matrices.bfloat16().mT if tall else matrices.bfloat16()
+    x = x / x.flatten(1).norm(dim=1)[:, None, None].clamp(min=group["eps"])
+    for _ in range(group["ns_steps"]):
+        gram = x @ x.mT
+        x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+    return x.mT if tall else x
 
 
 class ComposedOptimiser(Optimizer):

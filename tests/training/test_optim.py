@@ -12,7 +12,15 @@ from torch import nn
 from memmlp.common.errors import InputError
 from memmlp.runs.run import Run
 from memmlp.training.loop import ValidationCallback, train
-from memmlp.training.optim import EMA, ComposedOptimiser, Float32Products, Muon, Optim, ScheduleFree
+from memmlp.training.optim import (
+    EMA,
+    BatchedMuon,
+    ComposedOptimiser,
+    Float32Products,
+    Muon,
+    Optim,
+    ScheduleFree,
+)
 from memmlp.training.train_network import MotionTask
 
 COMMON = {"steps": 12, "batch": 4, "lr": 1e-2, "checkpoint_every": 5, "log_every": 4}
@@ -158,3 +166,21 @@ def test_products_are_exact_but_for_one_rounding():
     torch.testing.assert_close(sum_, expected, rtol=2**-8, atol=2**-8)
     assert torch.equal(plain, method)
     assert {x.dtype for x in (plain, method, sum_)} == {torch.bfloat16}
+
+
+def test_batched_muon_takes_the_steps_of_torchs_muon():
+    torch.manual_seed(0)
+    start = [torch.randn(size) for size in ((24, 8), (24, 8), (8, 24), (8, 8), (24, 8))]
+    results = []
+    for kind in (torch.optim.Muon, BatchedMuon):
+        weights = [one.clone().requires_grad_() for one in start]
+        optimiser = kind(weights, 0.1, 0.3, 0.9, adjust_lr_fn="match_rms_adamw")
+        for step in range(3):
+            torch.manual_seed(step)
+            for one in weights[: 4 + step % 2]:  # the last one does not always have a gradient
+                one.grad = torch.randn_like(one)
+            optimiser.step()
+            optimiser.zero_grad()
+        results.append([one.detach() for one in weights])
+    for made, expected in zip(*results, strict=True):
+        torch.testing.assert_close(made, expected, atol=2e-3, rtol=0)  # bfloat16
