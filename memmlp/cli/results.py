@@ -246,12 +246,12 @@ def searches(folders: tuple[Path, ...], out: Path, outputs: Path) -> None:
     a row for each trial, summary.md a row for each search.
     """
     from memmlp.common.files import atomic_write
-    from memmlp.sweep.search.earlier_searches import format_summary, format_trials, read_search
+    from memmlp.sweep.search.earlier_searches import FinishedSearch, format_summary, format_trials
 
     chosen = folders or sorted(path.parent for path in (outputs / "tune").glob("*/trials.csv"))
     if not chosen:
         raise InputError(f"{outputs / 'tune'}: has no finished searches; run memmlp tune")
-    found = [read_search(folder.absolute()) for folder in chosen]
+    found = [FinishedSearch(folder.absolute()) for folder in chosen]
     out.mkdir(parents=True, exist_ok=True)
     atomic_write(out / "trials.csv", format_trials(found))
     summary = "\n".join(format_summary(found))

@@ -111,8 +111,8 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     from memmlp.common.files import digest
     from memmlp.config.compose import compose_plain
     from memmlp.config.plugins import activate, find_named_packages
-    from memmlp.sweep.search.earlier_searches import BestTrial, read_best_trial
-    from memmlp.sweep.search.search_file import parse_search
+    from memmlp.sweep.search.earlier_searches import FinishedSearch
+    from memmlp.sweep.search.search_file import Search, parse_search
 
     activate(find_named_packages(overrides))
     own = [text for text in overrides if Override.parse(text).group == "search"]
@@ -121,12 +121,13 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
         raise InputError("search: must be the name of a file in conf/search")
     activate(find_named_packages(map(str, content.get("base") or ())))
     remaining = tuple(text for text in overrides if text not in own)
-    _complete_kinematic_loss(content, [*content["base"], *remaining])
-    best = BestTrial()
+    _complete_kinematic_loss(content, [*(content.get("base") or ()), *remaining])
+    best: dict[str, Value] = {}
     if isinstance(folder := content.get("after"), str):
-        best = read_best_trial(Path(folder))
-        content["base"] = [*best.overrides, *content["base"]]
-    parsed = parse_search(content, best.values)
+        earlier = FinishedSearch(Path(folder))
+        best = earlier.best_values
+        content["base"] = [*earlier.overrides, *Search.overrides(best), *(content.get("base") or ())]
+    parsed = parse_search(content, best)
     setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
     base = _check_space(setup)
     if not _make_requests(setup, {})[0].motion.prepare().has("val"):

@@ -1,11 +1,10 @@
-"""Reads finished searches from their folders: the best trial, and a summary of all trials."""
+"""Reads finished searches from their folders, for a later search and for summaries."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,89 +17,58 @@ from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import Search, Value
 
 
-@dataclass(frozen=True)
-class BestTrial:
-    """The best trial of a finished search: its values by key, and all its overrides."""
-
-    values: Mapping[str, Value] = field(default_factory=dict)
-    overrides: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class FinishedSearch:
     """A finished search.
 
+    Args:
+        folder: the search's folder, outputs/tune/NAME-ID.
+
     Attributes:
-        folder: the search's folder; its name identifies the search.
-        content: the search file's keys, and `command_line`.
+        content: the keys of the search file.
+        objective: the first objective.
+        keys: the searched keys.
+        overrides: the overrides of all trials.
+        network: the overrides that choose the network, such as "model=mem_mlp model.frames=60".
         trials: the rows of trials.csv.
+        complete: the complete trials, the best one first.
+
+    Raises:
+        InputError: if the folder does not have a finished search.
     """
 
-    folder: Path
-    content: Mapping[str, Any]
-    trials: list[dict[str, str]]
-
-    @property
-    def objective(self) -> str:
-        """The first objective."""
-        return str(self.content["objectives"][0]["text"])
-
-    @property
-    def keys(self) -> list[str]:
-        """The searched keys."""
-        return [one["key"] for one in self.content["space"]]
-
-    @property
-    def overrides(self) -> list[str]:
-        """The overrides of all trials."""
-        return [*self.content["base"], *self.content["command_line"]]
-
-    @property
-    def network(self) -> str:
-        """The overrides that choose the network, such as "model=mem_mlp model.frames=60"."""
-        chosen = [one for one in parse_overrides(self.overrides) if one.group == "model"]
-        return " ".join(one.text for one in chosen) or "model=mem_mlp"
-
-    @property
-    def complete(self) -> list[dict[str, str]]:
-        """The complete trials, the best one first."""
+    def __init__(self, folder: Path):
+        content, path = read_json(folder / "search.json"), folder / "trials.csv"
+        if "command_line" not in content or not path.is_file():
+            raise InputError(
+                f"{folder}: must be the folder of a finished search, with search.json and trials.csv"
+            )
+        self.folder, self.content = folder, content
+        self.objective = str(content["objectives"][0]["text"])
+        self.keys = [str(one["key"]) for one in content["space"]]
+        self.overrides = (*content["base"], *content["command_line"])
+        model = [one.text for one in parse_overrides(self.overrides) if one.group == "model"]
+        self.network = " ".join(model) or "model=mem_mlp"
+        self.trials = list(csv.DictReader(io.StringIO(path.read_text())))
         complete = [row for row in self.trials if row["state"] == "complete"]
-        return sorted(complete, key=lambda row: float(row[self.objective]))
+        self.complete = sorted(complete, key=lambda row: float(row[self.objective]))
 
-    def get_values(self, row: Mapping[str, str]) -> dict[str, Value]:
-        """Return a trial's values by key."""
-        return {key: yaml.safe_load(row[key]) for key in self.keys if row[key] != ""}
+    @property
+    def best_values(self) -> dict[str, Value]:
+        """The values of the best trial by key. Raises InputError if no trial is complete."""
+        if not self.complete:
+            raise InputError(f"{self.folder}: no trial is complete; expected a search with a best trial")
+        return {key: yaml.safe_load(text) for key in self.keys if (text := self.complete[0][key])}
 
     def measure_compute(self, row: Mapping[str, str]) -> list[float]:
         """Return the recorded compute of a trial's runs, TFLOP."""
         runs = (Run.from_id(self.folder.parent.parent, name) for name in row["run"].split())
-        return [float(found) for run in runs if (found := run.manifest.get("tflop")) is not None]
+        return [float(tflop) for run in runs if (tflop := run.manifest.get("tflop")) is not None]
 
 
-def read_search(folder: Path) -> FinishedSearch:
-    """Read a search's folder. Raises InputError if it is not the folder of a finished search."""
-    content, path = read_json(folder / "search.json"), folder / "trials.csv"
-    if "command_line" not in content or not path.is_file():
-        raise InputError(
-            f"{folder}: must be the folder of a finished search, with search.json and trials.csv"
-        )
-    return FinishedSearch(folder, content, list(csv.DictReader(io.StringIO(path.read_text()))))
-
-
-def read_best_trial(folder: Path) -> BestTrial:
-    """Read the best trial of a finished search. Raises InputError if no trial is complete."""
-    search = read_search(folder)
-    if not search.complete:
-        raise InputError(f"{folder}: no trial is complete; expected a search with a best trial")
-    values = search.get_values(search.complete[0])
-    return BestTrial(values, (*search.overrides, *Search.overrides(values)))
-
-
-def format_trials(searches: Iterable[FinishedSearch]) -> str:
-    """Return all trials of several searches as CSV, with recorded compute and the union of all keys."""
-    every = list(searches)
-    keys = list(dict.fromkeys(key for one in every for key in one.keys))
-    head = [
+def format_trials(searches: Sequence[FinishedSearch]) -> str:
+    """Return all trials of several searches as CSV, with recorded compute and the keys of all searches."""
+    keys = dict.fromkeys(key for search in searches for key in search.keys)
+    columns = [
         "search",
         "network",
         "budget",
@@ -114,30 +82,34 @@ def format_trials(searches: Iterable[FinishedSearch]) -> str:
         "run",
     ]
     text = io.StringIO()
-    writer = csv.DictWriter(text, head, lineterminator="\n", restval="")
+    writer = csv.DictWriter(text, columns, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
-    for search in every:
-        about = {"search": search.folder.name, "network": search.network, "budget": search.content["tflop"]}
+    for search in searches:
+        name, budget = search.objective, search.content["tflop"]
+        about: dict[str, Any] = {"search": search.folder.name, "network": search.network, "budget": budget}
         for row in search.trials:
             tflop = " ".join(f"{one:.4g}" for one in search.measure_compute(row))
-            name = search.objective
-            facts = {"objective": name, "value": row[name], "sd": row.get(f"{name} sd", ""), "tflop": tflop}
-            copied = {key: row[key] for key in ("trial", "state", "run", *search.keys)}
-            writer.writerow({**about, **facts, **copied})
+            result = {"objective": name, "value": row[name], "sd": row.get(f"{name} sd"), "tflop": tflop}
+            writer.writerow({**row, **about, **result})
     return text.getvalue()
 
 
-def format_summary(searches: Iterable[FinishedSearch]) -> Iterator[str]:
+def format_summary(searches: Sequence[FinishedSearch]) -> Iterator[str]:
     """Yield the lines of a Markdown table with each search's budget and best trial."""
     yield "| search | network | TFLOP | recorded, TFLOP | complete trials | best on validation | values |"
     yield "|---|---|---|---|---|---|---|"
-    for one in searches:
-        compute = [found for row in one.complete for found in one.measure_compute(row)]
+    for search in searches:
+        compute = [one for row in search.complete for one in search.measure_compute(row)]
         recorded = f"{min(compute):.3g} to {max(compute):.3g}" if compute else "-"
-        best = one.complete[0] if one.complete else {}
-        spread = f" ± {float(sd):.3f}" if (sd := best.get(f"{one.objective} sd")) else ""
-        result = f"{one.objective} {float(best[one.objective]):.3f}{spread}" if best else "-"
-        values = " ".join(Search.overrides(one.get_values(best))) if best else ""
-        counts = f"{len(one.complete)} of {len(one.trials)}"
-        cells = (one.folder.name, one.network, one.content["tflop"] or "-", recorded, counts, result, values)
+        result = values = "-"
+        if search.complete:
+            best, name = search.complete[0], search.objective
+            sd = f" ± {float(best[f'{name} sd']):.3f}" if f"{name} sd" in best else ""
+            result, values = (
+                f"{name} {float(best[name]):.3f}{sd}",
+                " ".join(Search.overrides(search.best_values)),
+            )
+        count = f"{len(search.complete)} of {len(search.trials)}"
+        budget = search.content["tflop"] or "-"
+        cells = search.folder.name, search.network, budget, recorded, count, result, values
         yield f"| {' | '.join(map(str, cells))} |"

@@ -12,7 +12,7 @@ from fake_search import SPACE, finish, open_study, search, seeded
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.runs.run import Run
-from memmlp.sweep.search.earlier_searches import format_summary, format_trials, read_best_trial, read_search
+from memmlp.sweep.search.earlier_searches import FinishedSearch, format_summary, format_trials
 from memmlp.sweep.search.results import write_trials
 
 
@@ -36,16 +36,15 @@ def test_the_best_trial_with_all_its_overrides(tmp_path: Path):
     folder = finished(tmp_path, ["model=rpm", "profile=tiny"], tflop=5)
     rows = list(csv.DictReader((folder / "trials.csv").read_text().splitlines()))
     best = min(rows, key=lambda row: float(row["MPJPE"]))
-    found = read_best_trial(folder)
+    found = FinishedSearch(folder)
     expected = {key: float(best[key]) for key in ("loss.rotation_all", "loss.hand")}
-    assert found.values == expected
-    words = tuple(f"{key}={value}" for key, value in expected.items())
-    assert found.overrides == ("loss=manual", "model=rpm", "profile=tiny", *words)
+    assert found.best_values == expected
+    assert found.overrides == ("loss=manual", "model=rpm", "profile=tiny")
 
 
 def test_the_summary_has_budgets_and_best_trials(tmp_path: Path):
     folders = [finished(tmp_path, ["model=rpm"], tflop=5), finished(tmp_path, ["seed=3"], seeds=2, seed=1)]
-    searches = list(map(read_search, folders))
+    searches = list(map(FinishedSearch, folders))
     *_, first, second = format_summary(searches)
     assert first.startswith("| model-rpm | model=rpm | 5 | 5.1 to 5.1 | 6 of 6 | MPJPE ")
     assert second.startswith("| seed-3 | model=mem_mlp | - | 5.1 to 5.1 | 6 of 6 | MPJPE ")
@@ -58,7 +57,7 @@ def test_the_summary_has_budgets_and_best_trials(tmp_path: Path):
 
 def test_a_folder_without_a_finished_search_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="must be the folder of a finished search"):
-        read_search(tmp_path)
+        FinishedSearch(tmp_path)
 
 
 def test_a_range_around_the_best_value():
