@@ -192,7 +192,8 @@ def _check_space(setup: SearchSetup) -> str:
         if not isinstance(configs[0].get(one.key), Mapping) and not counts:
             raise InputError(f"search.space.{one.key}: does not change the training")
     first = _make_tasks(setup, next(iter(setup.search.list_first_trials()), {}))[0][-1]
-    often = f"validated every {first.config['optim']['validate_every']} steps"  # trials can be pruned then
+    validated = [first.config["optim"][key] for key in ("validate_every", "validation_pieces")]
+    often = f"validated every {validated[0]} steps on {validated[1]} pieces"  # trials can be pruned then
     trained = digest(
         [one.identity("").id for one in requests]
     )  # the first trial may lack components of the limits

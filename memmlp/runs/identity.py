@@ -89,6 +89,7 @@ NEUTRAL = (
     "optim.checkpoint_every",
     "optim.log_every",
     "optim.validate_every",
+    "optim.validation_pieces",
     "hydra",
 )
 """Config keys that do not change results of any stage."""
@@ -290,7 +291,7 @@ def select_training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     if "optim.tflop" in counting:  # it sets the number of steps
         counting.remove("optim.steps")
     if "optim.best_by" in counting:
-        counting.append("optim.validate_every")
+        counting += [key for key in ("optim.validate_every", "optim.validation_pieces") if key in flat]
     return {key: _normalize_numbers(flat[key]) for key in counting}
 
 

@@ -65,6 +65,8 @@ class OptimSettings(Settings):
     )  # number of steps between checkpoints
     # number of steps between validations; below 1: a fraction of all steps
     validate_every: int | float = setting(steps_or_fraction(zero=False), "${profile.validate_every}")
+    # number of validation pieces of four seconds, evenly spread over the clips; null: all
+    validation_pieces: int | None = setting(at_least(1), None)
     # rotation or position: the weights with this branch's lowest validation MPJPE are kept; null: the last
     best_by: str | None = setting(one_of("rotation", "position"), None)
     log_every: int = setting(
@@ -155,6 +157,7 @@ class Optim:
     log_every: int = 50
     tflop: float | None = None
     best_by: str | None = None
+    validation_pieces: int | None = None
 
     def with_lr(self, lr: float | None) -> Self:
         """Return a copy with another initial learning rate; the final rate is scaled by the same factor.

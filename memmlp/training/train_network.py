@@ -69,12 +69,17 @@ class Training:
 
 
 def make_validation(
-    data: PreparedMotion, metrics: UserMetrics, device: torch.device
+    data: PreparedMotion, metrics: UserMetrics, device: torch.device, count: int | None = None
 ) -> Callable[[MotionModel], dict[str, float]]:
-    """Return a function that measures a network on the validation clips; {} without validation clips."""
+    """Return a function that measures a network on the validation clips; {} without validation clips.
+
+    It measures `count` pieces of the clips, evenly spread, or all of them.
+    """
     if not data.has("val"):
         return lambda network: {}
     pieces = modes.cut_clips(data.open("val").to(device), VALIDATION_PIECE, least=60)
+    if count is not None and count < len(pieces):
+        pieces = [pieces[i * len(pieces) // count] for i in range(count)]
     return lambda network: modes.measure_stream(network, pieces, metrics)
 
 
@@ -146,7 +151,7 @@ class NetworkTraining(Training):
             MirroredDataset(dataset) if self.mirror else dataset,
             self.optim,
             self.seed,
-            validate=make_validation(data, self.metrics, device),
+            validate=make_validation(data, self.metrics, device, self.optim.validation_pieces),
             drawn_by=self.drawn_by,
             shares=self.shares,
         )

@@ -117,7 +117,7 @@ class RefinerTraining(Training):
         finished = replace(architecture, refiner=None).load(prerequisite).to(device).requires_grad_(False)
         torch.manual_seed(self.seed)
         model = self.refiner.build(finished).to(device)
-        validate = make_validation(data, self.metrics, device)
+        validate = make_validation(data, self.metrics, device, self.optim.validation_pieces)
         task = RefinerTask(
             model,
             LOSSES[self.refiner.velocities](),

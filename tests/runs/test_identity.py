@@ -92,4 +92,6 @@ def test_a_budget_counts_instead_of_steps_and_validations_where_they_choose_the_
     assert moved(steps, tflop=5.0)
     assert not moved(steps | {"tflop": 5.0}, steps=6)
     assert moved(steps | {"tflop": 5.0}, tflop=6.0)
-    assert moved(steps | {"best_by": "rotation"}, validate_every=3)
+    for changes in ({"validate_every": 3}, {"validation_pieces": 3}):
+        assert moved(steps | {"best_by": "rotation"}, **changes)
+        assert not moved(steps, **changes)

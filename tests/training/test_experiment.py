@@ -50,7 +50,7 @@ CHANGES: dict[str, str] = {
     "optim.warmup": "3", "optim.ema": "0.9", "optim.tflop": "1e-5",
     "optim.clip_norm": "1e-3",
     "optim.precision": "bf16", "optim.compile": "true", "optim.checkpoint_every": "1",
-    "optim.validate_every": "1", "optim.log_every": "1",
+    "optim.validate_every": "1", "optim.validation_pieces": "1", "optim.log_every": "1",
     "evaluation.modes": "[stream]", "evaluation.batch": "1", "evaluation.ik": "off",
     "evaluation.ik_iterations": "3",
     "export.graph": "naive", "export.precision": "int8", "export.opset": "15", "export.latency_steps": "250",
@@ -71,8 +71,8 @@ LAST_DIGITS = {"threads", "device", "optim.compile", "data.min_frames"}
 """Keys that may leave every digit as it was: recorded and flagged, or of no effect here."""
 NOWHERE = {
     "force", "save_predictions", "data.name", "data.strict", "optim.checkpoint_every", "optim.log_every",
-    "optim.validate_every", "evaluation.modes", "evaluation.batch", "loggers.mlflow.uri",
-    "loggers.wandb.project",
+    "optim.validate_every", "optim.validation_pieces", "evaluation.modes", "evaluation.batch",
+    "loggers.mlflow.uri", "loggers.wandb.project",
 }  # fmt: skip
 """Keys that change no result; what they do has tests of its own."""
 TOGETHER = sorted(NOWHERE - {"evaluation.modes"})  # which leaves a mode out

@@ -1,10 +1,13 @@
 """The training of networks, of VQ-VAEs, and of their parts without validation clips."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from memmlp.runs.lookup import list_runs
+from memmlp.training import train_network
 from memmlp.training.train_sage import PARTS
 
 UNVALIDATED = [
@@ -41,3 +44,15 @@ def test_a_search_needs_validation_clips(memmlp):
     assert ran.code == 2
     assert ran.err.startswith("memmlp: data.split.val: must be above 0 for a search")
     assert ran.err.count("\n") == 1
+
+
+def test_a_validation_may_take_some_pieces_evenly_spread(monkeypatch):
+    pieces = [torch.full((60, 1), float(number)) for number in range(10)]
+    monkeypatch.setattr(train_network.modes, "cut_clips", lambda *_, **__: pieces)
+    monkeypatch.setattr(
+        train_network.modes, "measure_stream", lambda network, given, metrics: [int(one[0]) for one in given]
+    )
+    data = SimpleNamespace(has=lambda part: True, open=lambda part: torch.zeros(1))
+    for count, expected in ((None, list(range(10))), (99, list(range(10))), (4, [0, 2, 5, 7])):
+        validate = train_network.make_validation(data, {}, torch.device("cpu"), count)
+        assert validate(None) == expected

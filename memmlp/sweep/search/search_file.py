@@ -129,11 +129,12 @@ class Search:
 
     @property
     def budget(self) -> tuple[str, ...]:
-        """The overrides of a fixed compute: its trainings keep their best weights, out of ten validations."""
+        """The overrides of a fixed compute; the weights of the best of five validations are kept."""
         if self.tflop is None:
             return ()
         branch = self.objectives[0].terms[0][1].split()[0]
-        return f"optim.tflop={self.tflop}", f"optim.best_by={branch}", "optim.validate_every=0.1"
+        validation = "optim.validate_every=0.2", "optim.validation_pieces=32"
+        return f"optim.tflop={self.tflop}", f"optim.best_by={branch}", *validation
 
     @staticmethod
     def overrides(values: Mapping[str, Value]) -> tuple[str, ...]:
