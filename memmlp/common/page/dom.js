@@ -22,13 +22,6 @@ export function link(href, ...children) {
   return h('a', { href }, ...children);
 }
 
-// A group of buttons of which one is chosen.
-export function choice(label, options, chosen, choose) {
-  const buttons = options.map(([value, text]) =>
-    h('button', { type: 'button', 'aria-pressed': String(value === chosen), onclick: () => choose(value) }, text));
-  return h('div', { class: 'choice', role: 'group', 'aria-label': label }, buttons);
-}
-
 export function select(label, options, chosen, choose) {
   const list = h('select', { onchange: event => choose(event.target.value) },
     options.map(([value, text]) => h('option', { value, selected: value === chosen }, text)));
@@ -50,6 +43,12 @@ export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short
 
 export function empty(title, ...children) {
   return h('div', { class: 'empty' }, h('p', { class: 'lead' }, title), ...children);
+}
+
+// A page of linked cards, [address, title, subtitle, content], or what to do without any.
+export function cards(title, list, none) {
+  const items = list.map(([href, head, subtitle, content]) => h('li', {}, h('a', { class: 'card', href }, h('span', { class: 'card-title' }, head), h('span', { class: 'faint' }, subtitle), content)));
+  return [h('div', { class: 'bar' }, h('h1', {}, title), h('p', { class: 'count' }, list.length)), list.length ? h('ul', { class: 'cards' }, items) : none];
 }
 
 // Tell a screen reader what changed on the page.

@@ -84,8 +84,8 @@ def test_filter_sort_compare_and_the_address(browser: Browser, server: RunsServe
     go(browser, server.url, route.removeprefix("#/"), f"{NAMES}.length == 3")
     assert browser.value(NAMES) == names[::-1]
     browser.click(".runs thead input")
-    browser.wait("document.querySelector('a.button').textContent == 'Compare 3'")
-    browser.click("a.button")
+    browser.wait("document.querySelector('button.primary').textContent == 'Compare 3'")
+    browser.click("button.primary")
     browser.wait("document.querySelectorAll('.plot svg path').length >= 3")
     assert browser.value("document.querySelector('h1').textContent") == "3 runs"
     label = browser.value("document.querySelector('.plot svg').ariaLabel")
@@ -117,7 +117,6 @@ def test_a_run_s_page_and_its_replay(browser: Browser, server: RunsServer, home:
     assert "Its network: hardly trained (its steps saw 6.1" in browser.value(
         "document.querySelector('.warning').textContent"
     )
-    assert browser.value("document.querySelectorAll('.meter').length") == 12
 
 
 def test_a_sweep_s_effects_curves_and_rounds(browser: Browser, tmp_path: Path):
@@ -209,7 +208,7 @@ def test_news_are_shown_without_a_touch(browser: Browser, server: RunsServer, ho
 
 
 def test_data_is_never_markup_and_damage_is_shown(browser: Browser, server: RunsServer):
-    for route in ("runs?kind=all", f"run/{'e' * 16}", f"compare?runs={'e' * 16},abcdef0123456789"):
+    for route in ("runs", f"run/{'e' * 16}", f"compare?runs={'e' * 16},abcdef0123456789"):
         go(browser, server.url, route, "document.body.textContent.includes('<img src=x')")
         assert browser.value("document.querySelectorAll('main img').length") == 0
         assert browser.value("typeof owned") == "undefined"

@@ -1,6 +1,6 @@
 // Receives frames as server-sent events, and shows them with the state of the trackers.
 
-import { h, replace } from './dom.js';
+import { h } from './dom.js';
 import { Viewer } from './viewer.js';
 import { Wearer } from './wearer.js';
 
@@ -16,15 +16,12 @@ const viewer = new Viewer([
   ['mean', 'mean error', 'cm', frame => frame.mean?.toFixed(1)],
   ['step', 'step, median / p95', 'ms', () => viewer.timing('ms')],
   ['whole', 'to outputs, median / p95', 'ms', () => viewer.timing('whole')],
-  ['share', 'p95 in a frame’s time', '%', () => (viewer.timing('whole').split(' / ')[1] * greeting.fps / 10).toFixed(0)],
-  ['drawn', 'this page, median / p95', 'ms', () => viewer.timing('drawn')],
   ['frames', 'frames', '', frame => frame.number + 1],
   ['dropped', 'dropped', '', frame => frame.dropped],
   ['malformed', 'malformed', '', frame => frame.malformed],
   ['jumping', 'times jump', '', frame => (frame.jumping ? 'in seconds?' : null)],
 ], { refresh: showState });
 document.querySelector('main').prepend(viewer.element);
-addEventListener('keydown', event => viewer.press(event));
 
 const events = new EventSource('events');
 events.addEventListener('greeting', event => {
@@ -46,11 +43,9 @@ function greet(message) {
   if (!greeting) viewer.describe(message);
   if (!greeting && message.avatar && viewer.stage) loadAvatar(message.avatar);
   greeting = message;
-  $('about').textContent = `${message.network} · ${message.source}`;
+  $('about').textContent = [message.network, message.source, ...message.outputs].join(' · ');
   viewer.showRemark(message.remark);
   $('wearer').hidden = !message.wearer;
-  $('targets').hidden = !message.outputs.length;
-  replace($('outputs'), message.outputs.map(name => h('li', {}, name)));
 }
 
 // The avatar's scripts are fetched only if the command serves an avatar.
@@ -58,10 +53,6 @@ async function loadAvatar(description) {
   try {
     const { Avatar } = await import('./avatar.js');
     viewer.stage.addAvatar(await Avatar.load('avatar.vrm', description));
-    const toggle = h('button', { type: 'button', 'aria-pressed': 'true', onclick: () => {
-      toggle.setAttribute('aria-pressed', String(viewer.stage.toggleAvatar()));
-    } }, 'Avatar');
-    viewer.transport.append(toggle);
     document.documentElement.dataset.avatar = 'loaded';
   } catch (error) {
     viewer.element.append(h('p', { class: 'warning' }, `The avatar cannot be shown (${error.message}).`));

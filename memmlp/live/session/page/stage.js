@@ -60,15 +60,11 @@ export class Stage {
     this.scene.add(avatar.scene);
   }
 
-  // Switch between avatar and limbs; return whether the avatar is shown.
-  toggleAvatar() { return (this.avatar.scene.visible = !this.avatar.scene.visible); }
-
   show(frame) {
     const { positions, truth, errors } = frame;
-    const avatar = Boolean(this.avatar?.scene.visible);
-    this.prediction.group.visible = !avatar;
-    this.truth.group.visible = errors !== null && !avatar;
-    if (avatar) this.avatar.pose(frame.turns, positions, frame.hips);
+    this.prediction.group.visible = !this.avatar;
+    this.truth.group.visible = errors !== null && !this.avatar;
+    if (this.avatar) this.avatar.pose(frame.turns, positions, frame.hips);
     else this.prediction.pose(positions, errors ? this.heat.bind(null, errors) : () => this.grey);
     if (this.truth.group.visible) this.truth.pose(truth, () => this.grey);
     this.follow(truth ?? positions);

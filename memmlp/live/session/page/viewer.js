@@ -14,10 +14,10 @@ export class Viewer {
     this.remark = h('p', { class: 'warning', id: 'remark', hidden: true });
     this.views = names.map(name => ({ name, canvas: h('canvas', { 'aria-label': `${name || 'Truth and prediction'} in 3D` }), error: h('b', { class: 'n' }) }));
     this.problem = h('p', { class: 'trouble', hidden: true });
-    this.pause = h('button', { type: 'button', class: 'primary', id: 'pause', title: 'Space', onclick: () => this.togglePause() }, 'Pause');
+    this.pause = h('button', { type: 'button', class: 'primary', id: 'pause', onclick: () => this.togglePause() }, 'Pause');
     this.scrub = h('input', { type: 'range', id: 'scrub', min: 0, max: 0, step: 1, 'aria-label': 'Frame', oninput: () => this.choose(this.scrub.valueAsNumber) });
     this.time = h('output', {}, '0.00 s');
-    this.newest = h('button', { type: 'button', id: 'newest', title: 'End', onclick: () => this.resume() }, 'Newest');
+    this.newest = h('button', { type: 'button', id: 'newest', onclick: () => this.resume() }, 'Newest');
     this.transport = h('div', { class: 'transport' }, this.pause, this.scrub, this.time, this.newest);
     this.facts = new Facts(facts);
     this.scale = h('p', { class: 'scale', hidden: true });
@@ -73,16 +73,6 @@ export class Viewer {
   resume() { this.chosen = null; }
   togglePause() { return this.paused ? this.resume() : this.choose(this.shown?.number ?? 0); }
 
-  // The space bar pauses, the arrow keys step a frame, End continues.
-  press(event) {
-    if (event.target.matches('input[type=number], button')) return;
-    const step = by => this.choose((this.shown?.number ?? 0) + by);
-    const actions = { ' ': () => this.togglePause(), ArrowLeft: () => step(-1), ArrowRight: () => step(1), End: () => this.resume() };
-    if (!(event.key in actions)) return;
-    event.preventDefault();
-    actions[event.key]();
-  }
-
   // The median and 95th percentile of a time of the newest frames, as text; null without times.
   timing(key) {
     const found = percentiles(this.frames.slice(-TIMED).map(frame => frame[key]).filter(ms => ms !== undefined));
@@ -93,9 +83,7 @@ export class Viewer {
     if (!this.element.isConnected) return;
     const frame = this.shown;
     if (this.stage && frame) {
-      const began = performance.now();
       this.draw(frame);
-      frame.drawn = performance.now() - began;
       document.documentElement.dataset.shown = frame.number;
     }
     if (now - this.refreshed > REFRESH) {

@@ -102,12 +102,10 @@ export class MirrorScene {
 
 // The mirror's frame, and a film that makes the image behind it a little paler.
 function makeFrame() {
-  const rectangle = (width, bottom, top) => new THREE.Shape([[-1, bottom], [1, bottom], [1, top], [-1, top]].map(([x, y]) => new THREE.Vector2((x * width) / 2, y)));
-  const border = rectangle(WIDTH + 0.1, -0.05, HEIGHT + 0.05);
-  border.holes.push(rectangle(WIDTH, 0, HEIGHT));
-  const wood = new THREE.MeshStandardMaterial({ color: 0x3a4550, roughness: 0.6 });
   const film = new THREE.MeshBasicMaterial({ color: 0xbfd4e6, transparent: true, opacity: 0.25, depthWrite: false });
-  return new THREE.Group().add(
-    new THREE.Mesh(new THREE.ExtrudeGeometry(border, { depth: 0.04, bevelEnabled: false }), wood),
-    new THREE.Mesh(new THREE.ShapeGeometry(rectangle(WIDTH, 0, HEIGHT)), film));
+  const wood = new THREE.MeshStandardMaterial({ color: 0x3a4550, roughness: 0.6 });
+  const bar = (x, y, width, height) => new THREE.Mesh(new THREE.BoxGeometry(width, height, 0.04).translate(x, y, 0), wood);
+  const [side, middle] = [WIDTH / 2 + 0.025, HEIGHT / 2];
+  return new THREE.Group().add(new THREE.Mesh(new THREE.PlaneGeometry(WIDTH, HEIGHT).translate(0, middle, 0), film),
+    bar(-side, middle, 0.05, HEIGHT), bar(side, middle, 0.05, HEIGHT), bar(0, -0.025, WIDTH + 0.1, 0.05), bar(0, HEIGHT + 0.025, WIDTH + 0.1, 0.05));
 }

@@ -12,7 +12,6 @@ const MODES = { 'immersive-vr': 'Enter VR', 'immersive-ar': 'Enter AR' };
 const COUNTDOWN = 3000; // milliseconds from the trigger to the calibration
 const MAX_WAITING = 2; // samples that wait for the network; later ones are skipped
 const TIMED = 600; // newest poses whose times are shown
-const INTERVALS = 91; // newest frames of the display, whose median gives its rate
 const [MIN_HEIGHT, MAX_HEIGHT] = [0.9, 2.4]; // metres; outside of them a floor or a height is wrong
 const INVITATION = ['Pull a trigger or pinch, then stand upright in T-pose:', 'arms to the sides, palms down, eyes forward'];
 
@@ -34,7 +33,7 @@ class VrPage {
     this.buttons = Object.entries(MODES).map(([mode, name]) =>
       h('button', { type: 'button', class: 'primary', id: mode, disabled: true, onclick: () => this.enter(mode) }, name));
     this.facts = new Facts([
-      ['rate', 'display', 'Hz', describeRate], ['frames', 'frames', '', user => user.frames], ['skipped', 'skipped samples', '', user => user.skipped],
+      ['frames', 'frames', '', user => user.frames], ['skipped', 'skipped samples', '', user => user.skipped],
       ['pose', 'pose, median / p95', 'ms', user => percentiles(user.times)?.map(ms => ms.toFixed(1)).join(' / ')],
       ['user-height', 'height', 'm', user => user.height.toFixed(2)],
     ]);
@@ -103,13 +102,12 @@ class VrPage {
     const height = this.measureHeight(null);
     const stream = new Stream({ ...network, offsets: usualOffsets([null, null]), scale: network.body.height / height, run: frame => opened.pose(frame) });
     this.user = {
-      session, stream, height, kinds: [null, null], placed: false, calibrated: false, due: null, waiting: 0, frames: 0, skipped: 0, last: null, intervals: [], times: [],
+      session, stream, height, kinds: [null, null], placed: false, calibrated: false, due: null, waiting: 0, frames: 0, skipped: 0, times: [],
     };
     this.view.hidden = false;
     mirror.showRoom(mode === 'immersive-ar');
     mirror.write(...INVITATION);
     session.addEventListener('select', () => { this.user.due ??= performance.now() + COUNTDOWN; });
-    session.addEventListener('visibilitychange', () => { this.user.last = null; });
     session.addEventListener('end', () => this.end());
     mirror.renderer.setAnimationLoop((time, frame) => this.tick(time, frame));
   }
@@ -118,7 +116,7 @@ class VrPage {
     const { mirror, user } = this;
     const space = mirror.renderer.xr.getReferenceSpace();
     if (frame && space && user) {
-      this.count(time);
+      if (++user.frames % 20 === 0) this.facts.show(user);
       const trackers = trackersOf(frame, space, user.session.inputSources);
       this.changeDevices(kindsOf(user.session.inputSources));
       if (trackers[0] && !user.placed) this.placeMirror(trackers[0]);
@@ -126,13 +124,6 @@ class VrPage {
       this.feed(trackers, time / 1000);
     }
     mirror.renderer.render(mirror.scene, mirror.camera); // the session supplies the canvas' size and the camera
-  }
-
-  count(time) {
-    const { user } = this;
-    if (user.last !== null) user.intervals = [...user.intervals, time - user.last].slice(-INTERVALS);
-    user.last = time;
-    if (++user.frames % 20 === 0) this.facts.show(user);
   }
 
   // Controllers and hands have different offsets, so a change makes the calibration invalid. A side without either keeps its kind.
@@ -209,11 +200,4 @@ class VrPage {
     this.mirror?.renderer.setAnimationLoop(null);
     this.mirror?.renderer.dispose();
   }
-}
-
-// The display's measured rate, and the expected rate if the browser reports it.
-function describeRate({ intervals, session }) {
-  if (!intervals.length) return null;
-  const rate = (1000 / percentiles(intervals)[0]).toFixed(0);
-  return session.frameRate ? `${rate} of ${session.frameRate.toFixed(0)}` : rate;
 }

@@ -4,8 +4,9 @@ import { h, replace } from './dom.js';
 import { number } from './format.js';
 
 const { d3, Plot } = window;
-export const COLOURS = Array.from({ length: 10 }, (_, i) => `var(--series${i})`);
+const COLOURS = Array.from({ length: 10 }, (_, i) => `var(--series${i})`);
 
+const MAX_POINTS = 240; // of a band
 let latest = 0; // the last chart's width: most have the same, so that a redrawn one does not jump
 
 // A figure that is drawn again when its width changes. draw(width) returns an element.
@@ -34,17 +35,13 @@ const base = (width, height, more) => ({
   ...more,
 });
 
-const nameWidth = names => Math.max(...names.map(name => name.length)) * 6.6 + 18;
-
-export function colourOf(groups) {
-  return new Map([...groups].map((group, i) => [group, COLOURS[i % COLOURS.length]]));
-}
+export const colourOf = groups => new Map(groups.map((group, i) => [group, COLOURS[i % COLOURS.length]]));
 
 const tip = (data, options) => Plot.tip(data, Plot.pointer({ fill: 'var(--card)', stroke: 'var(--line)', textPadding: 8, ...options }));
 
 // Curves by group with the band of each group's runs.
 // series: [{ run, group, steps, values }]
-export function curves(series, { label, log = false, smooth = 0, each = false, colours }) {
+export function curves(series, { label, log = false, smooth = 0, colours }) {
   const kept = series.map(one => smoothed(one, smooth)).filter(one => one.steps.length);
   const groups = [...new Set(kept.map(one => one.group))];
   const bands = groups.flatMap(group => band(kept.filter(one => one.group === group), group));
@@ -52,14 +49,14 @@ export function curves(series, { label, log = false, smooth = 0, each = false, c
     .filter(point => !log || point.value > 0);
   const single = new Set(groups.filter(group => kept.filter(one => one.group === group).length === 1));
   const wide = bands.filter(point => !single.has(point.group) && (!log || point.low > 0));
-  const lines = each ? points : points.filter(point => single.has(point.group));
+  const lines = points.filter(point => single.has(point.group));
   const tips = [...wide, ...lines.map(point => ({ ...point, mean: point.value }))];
   const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.42, 220), 400), {
     x: { label: 'step', ticks: Math.min(width / 90, 8), tickFormat: 's' },
     y: { label, type: log ? 'log' : 'linear', grid: true, nice: true, ticks: 5, tickFormat: log ? undefined : '~g' },
     marks: [
       Plot.areaY(wide, { x: 'step', y1: 'low', y2: 'high', z: 'group', fill: point => colours.get(point.group), fillOpacity: 0.16 }),
-      Plot.line(lines, { x: 'step', y: 'value', z: 'run', stroke: point => colours.get(point.group), strokeWidth: each && lines.length > wide.length ? 1.3 : 1.8, strokeOpacity: each ? 0.75 : 1 }),
+      Plot.line(lines, { x: 'step', y: 'value', z: 'run', stroke: point => colours.get(point.group), strokeWidth: 1.8 }),
       Plot.line(wide, { x: 'step', y: 'mean', z: 'group', stroke: point => colours.get(point.group), strokeWidth: 2 }),
       Plot.ruleX(tips, Plot.pointerX({ x: 'step', stroke: 'var(--faint)', strokeOpacity: 0.5 })),
       tip(tips, { x: 'step', y: 'mean', title: point => [point.group, `step ${point.step}`,
@@ -72,8 +69,6 @@ export function curves(series, { label, log = false, smooth = 0, each = false, c
   });
   return figure(`${label} by step. ${last.filter(Boolean).join('; ')}.`, draw);
 }
-
-const thin = (points, most) => points.filter((_, i) => i % Math.ceil(points.length / most) === 0);
 
 // A run without NaN values, as an exponential mean without bias at the beginning; weight 0 keeps the values.
 function smoothed({ steps, values, ...run }, weight) {
@@ -94,7 +89,7 @@ function band(series, group) {
   const last = d3.min(series, one => one.steps.at(-1));
   const at = series.map(({ steps, values }) => d3.scaleLinear([...steps, steps.at(-1) + 1], [...values, values.at(-1)]));
   const steps = [...d3.union(...series.map(one => one.steps))].filter(step => step >= first && step <= last).sort(d3.ascending);
-  return thin(steps, 240).map(step => {
+  return steps.filter((_, i) => i % Math.ceil(steps.length / MAX_POINTS) === 0).map(step => {
     const values = at.map(interpolate => interpolate(step));
     return { step, group, mean: d3.mean(values), low: d3.min(values), high: d3.max(values), count: values.length };
   });
@@ -107,7 +102,7 @@ export function forest(rows, { label, smallest }) {
   const colour = row => ({ holds: 'var(--good)', opposite: 'var(--bad)' })[row.verdict] ?? 'var(--accent)';
   const shorten = name => (name.length > 34 ? `${name.slice(0, 33)}…` : name);
   const draw = width => Plot.plot(base(width, 64 + 34 * domain.length, {
-    marginLeft: Math.min(nameWidth(domain), 230, width * 0.38), marginBottom: 38,
+    marginLeft: Math.min(6.6 * Math.max(...domain.map(name => name.length)) + 18, 230, width * 0.38), marginBottom: 38,
     x: { label: `${label}, difference`, grid: true, zero: true, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none' },
     y: { domain, label: null, tickSize: 0, tickFormat: shorten },
     marks: [

@@ -1,6 +1,6 @@
 // Curves of several runs, overlaid by run or by group with bands.
 
-import { h, replace, select, empty, choice } from './dom.js';
+import { h, replace, select, empty } from './dom.js';
 import { curvesOf, place, remember } from './store.js';
 import { colourOf, curves } from './charts.js';
 
@@ -26,7 +26,6 @@ export function curvePanel(ids, groupings) {
     const [groupName, , groupOf] = groupings.find(([name]) => name === setting('group')) ?? groupings[0];
     const groups = [...new Set(ids.filter(id => id in data).map(groupOf))];
     const colours = colourOf(groups);
-    const each = setting('each', groups.length === ids.length ? 'yes' : 'no') === 'yes';
     const smooth = Number(setting('smooth', '0'));
     const log = setting('log') === 'yes';
     const key = group => {
@@ -36,18 +35,15 @@ export function curvePanel(ids, groupings) {
     };
     const charts = list.map(name => {
       const series = ids.filter(id => data[id]?.[name] && !hidden.has(groupOf(id))).map(id => ({ run: id, group: groupOf(id), steps: data[id][name][0], values: data[id][name][1] }));
-      return h('div', { class: 'panel-chart' }, h('h3', {}, title(name)), curves(series, { label: title(name), log, smooth, each, colours }));
+      return h('div', { class: 'panel-chart' }, h('h3', {}, title(name)), curves(series, { label: title(name), log, smooth, colours }));
     });
     const tools = h('div', { class: 'tools' },
       groupings.length > 1 ? select('Group by', groupings.map(([value, text]) => [value, text]), groupName, group => set({ group })) : null,
-      groups.length < ids.length ? choice('Lines', [['no', 'means and bands'], ['yes', 'every run']], each ? 'yes' : 'no', value => set({ each: value })) : null,
-      choice('Scale', [['no', 'linear'], ['yes', 'log']], log ? 'yes' : 'no', value => set({ log: value })),
+      select('Scale', [['no', 'linear'], ['yes', 'log']], log ? 'yes' : 'no', value => set({ log: value })),
       h('label', { class: 'field' }, h('span', {}, 'Smooth'), h('input', { type: 'range', min: 0, max: 0.98, step: 0.02, value: smooth, onchange: event => set({ smooth: event.target.value }) })),
       select('Add a curve', [['', 'choose'], ...names.filter(name => !list.includes(name)).map(name => [name, title(name)])], '', name => name && set({ y: [...list, name].join('|') })),
       chosen.length ? h('button', { type: 'button', onclick: () => set({ y: '' }) }, 'Default curves') : null);
-    const focus = [...element.querySelectorAll('button, select, input')].indexOf(document.activeElement);
     replace(element, tools, groups.length > 1 ? h('div', { class: 'keys' }, groups.map(key)) : null, h('div', { class: 'charts' }, charts));
-    if (focus >= 0) element.querySelectorAll('button, select, input')[focus]?.focus();
   }
 
   async function update() {

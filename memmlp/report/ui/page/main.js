@@ -50,14 +50,6 @@ function showStatus(text, className = '') {
 
 addEventListener('hashchange', show);
 document.querySelector('.skip').addEventListener('click', event => { event.preventDefault(); content.focus(); });
-addEventListener('keydown', event => {
-  const filter = document.querySelector('input[type=search]');
-  if (event.key !== '/' || !filter || event.target.closest('input, select, textarea')) return;
-  event.preventDefault();
-  filter.focus();
-  filter.select();
-});
-
 showStatus(inFile ? 'a file' : 'connecting');
 await load().catch(error => replace(content, empty('The runs cannot be shown.', h('p', {}, error.message))));
 await show();

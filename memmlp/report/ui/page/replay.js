@@ -79,7 +79,6 @@ class Player extends Viewer {
     this.newest.remove();
     this.element.append(h('div', { class: 'pieces' }, this.pieces.map(({ button }) => button)),
       h('div', { class: 'keys' }, shown.map(([run], i) => h('span', { class: 'key still' }, h('i', { style: `background:${COLOURS[i]}` }), nameOf(run)))), this.chart);
-    Object.assign(this.element, { tabIndex: 0, role: 'group', ariaLabel: 'Replay; space plays, arrows step a frame', onkeydown: event => this.press(event) });
     this.describe({ ...body, top: Math.max(...shown.map(([, { top }]) => top)) });
   }
 
@@ -103,10 +102,5 @@ class Player extends Viewer {
     if (!inside) Object.assign(this, { start: this.first, count: this.frames.length });
     this.began = performance.now() - (1000 * (this.chosen - this.start)) / (this.fps * SPEED);
     super.resume();
-  }
-
-  press(event) {
-    if (event.key === 'Home') this.repeat(this.pieces[0].first, this.fps);
-    else super.press(event);
   }
 }

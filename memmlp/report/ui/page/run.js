@@ -1,13 +1,12 @@
 // A run: results beside the control's, worst seconds in 3D, curves, clips, config, latency, files.
 
-import { h, replace, link, section, select, choice, table } from './dom.js';
+import { h, replace, link, section, select, table } from './dom.js';
 import { address, ask, dataName, inFile, nameOf, place, remember, runs } from './store.js';
-import { ago, ARROWS, better, bytes, date, duration, effectDigits, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
+import { ago, ARROWS, better, bytes, DASH, date, duration, effectDigits, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
 import { curvePanel } from './curves.js';
 import { FINISHED, status, tags } from './runs.js';
 
 const METRICS = ['MPJPE', 'MPJRE', 'MPJVE', 'Jitter', 'Hand PE', 'Upper PE', 'Lower PE', 'Root PE', 'geodesic'];
-const calm = matchMedia('(prefers-reduced-motion: reduce)');
 
 export async function page(id) {
   let run = await ask(`run/${id}`);
@@ -38,7 +37,7 @@ function head(run) {
   const places = run.places.map(at => [' / ', at.sweep ? [link(address('sweep', at.sweep), at.sweep), ` · ${at.variant}, seed ${at.seed}`] : [link(address('search', at.search), at.search), ` · trial ${at.trial}`]]);
   return [
     h('p', { class: 'trail' }, link('#/runs', 'Runs'), places),
-    h('div', { class: 'bar title' }, h('h1', {}, nameOf(run)), status(run), tags(run)),
+    h('div', { class: 'bar' }, h('h1', {}, nameOf(run)), status(run), tags(run)),
     run.note ? h('p', { class: 'remark' }, run.note) : null,
   ];
 }
@@ -87,6 +86,7 @@ function results(run) {
 }
 
 const error = (clip, mode) => clip[mode]?.rotation?.MPJPE;
+const worstFirst = (run, mode) => [...run.clips].sort((a, b) => largestFirst(error(a, mode), error(b, mode)));
 const modesOf = run => ['stream', 'window'].filter(mode => run.clips.some(clip => clip[mode]));
 
 // The worst clips, one of which is replayed beside the truth and beside another run: the control's first, then the newest.
@@ -98,14 +98,13 @@ async function replaySection(run) {
   const tools = h('div', { class: 'tools' });
   const replay = new Replay(frame);
   const modes = modesOf(run);
-  const sorted = mode => [...run.clips].sort((a, b) => largestFirst(error(a, mode), error(b, mode)));
   const { query } = place();
-  const set = { clip: query.get('clip') ?? sorted(modes[0])[0]?.name, mode: query.get('mode') ?? modes[0], other: query.get('other') ?? others[0]?.id ?? '' };
+  const set = { clip: query.get('clip') ?? worstFirst(run, modes[0])[0]?.name, mode: query.get('mode') ?? modes[0], other: query.get('other') ?? others[0]?.id ?? '' };
 
   function draw() {
     replace(tools,
-      select('Clip, worst first', sorted(set.mode).map(clip => [clip.name, `${clip.name} (${number(error(clip, set.mode), 1)} cm)`]), set.clip, clip => choose({ clip })),
-      modes.length > 1 ? choice('Mode', modes.map(mode => [mode, mode]), set.mode, mode => choose({ mode })) : null,
+      select('Clip, worst first', worstFirst(run, set.mode).map(clip => [clip.name, `${clip.name} (${number(error(clip, set.mode), 1)} cm)`]), set.clip, clip => choose({ clip })),
+      modes.length > 1 ? select('Mode', modes.map(mode => [mode, mode]), set.mode, mode => choose({ mode })) : null,
       others.length ? select('Beside', [['', 'no other run'], ...others.map(other => [other.id, `${nameOf(other)} (${other.id.slice(0, 6)})`])], set.other, other => choose({ other })) : null);
     return replay.show(run, set.clip, set.mode, runs.get(set.other));
   }
@@ -121,24 +120,12 @@ async function replaySection(run) {
 
 function clips(run, replay) {
   const [mode] = modesOf(run);
-  const branches = Object.keys(run.clips[0][mode] ?? {}).filter(key => typeof run.clips[0][mode][key] === 'object');
-  const set = { by: 'MPJPE', branch: branches.includes('rotation') ? 'rotation' : branches[0] };
-  const element = h('div');
-  function draw() {
-    const value = (clip, metric) => clip[mode]?.[set.branch]?.[metric];
-    const metrics = ordered([...new Set(run.clips.flatMap(clip => Object.keys(clip[mode]?.[set.branch] ?? {})))].filter(metric => run.clips.some(clip => typeof value(clip, metric) === 'number')));
-    const order = [...run.clips].sort((a, b) => largestFirst(value(a, set.by), value(b, set.by)));
-    const most = order.map(clip => value(clip, set.by)).find(one => typeof one === 'number');
-    const share = one => (one === undefined ? 0 : typeof one === 'number' ? (100 * one) / (most || 1) : 100);
-    const headCell = metric => h('th', { scope: 'col', class: 'n', 'aria-sort': metric === set.by ? 'descending' : null }, h('button', { type: 'button', onclick: () => { set.by = metric; draw(); } }, metric, h('small', {}, metricWords(metric).unit)));
-    const play = clip => h('button', { type: 'button', class: 'small', 'aria-label': `Replay ${clip.name}`, onclick: () => { replay.choose({ clip: clip.name }); replay.element.scrollIntoView({ behavior: calm.matches ? 'auto' : 'smooth' }); } }, 'Replay');
-    const row = clip => [clip.name, clip.frames ? `${number(clip.frames / 60, 1)} s` : '–', h('td', { class: 'meter' }, h('i', { style: `width:${share(value(clip, set.by))}%` })), ...metrics.map(metric => metricNumber(metric, value(clip, metric))), play(clip)];
-    const hidden = text => h('span', { class: 'hidden' }, text);
-    replace(element, branches.length > 1 ? h('div', { class: 'tools' }, choice('Branch', branches.map(branch => [branch, branch]), set.branch, branch => { set.branch = branch; draw(); })) : null,
-      table(['clip', 'length', hidden('bar'), ...metrics.map(headCell), hidden('replay')], order.map(row)));
-  }
-  draw();
-  return section(`Test clips (${run.clips.length}), ${mode} mode`, element);
+  const value = (clip, metric) => clip[mode]?.rotation?.[metric];
+  const metrics = ordered([...new Set(run.clips.flatMap(clip => Object.keys(clip[mode]?.rotation ?? {})))].filter(metric => run.clips.some(clip => typeof value(clip, metric) === 'number')));
+  const play = clip => h('button', { type: 'button', class: 'small', 'aria-label': `Replay ${clip.name}`, onclick: () => { replay.choose({ clip: clip.name }); replay.element.scrollIntoView(); } }, 'Replay');
+  const row = clip => [clip.name, clip.frames ? `${number(clip.frames / 60, 1)} s` : DASH, ...metrics.map(metric => metricNumber(metric, value(clip, metric))), play(clip)];
+  const head = metric => h('th', { scope: 'col', class: 'n' }, metric, h('small', {}, metricWords(metric).unit));
+  return section(`Test clips (${run.clips.length}), ${mode} mode`, table(['clip', 'length', ...metrics.map(head), ''], worstFirst(run, mode).map(row)));
 }
 
 function config(run) {

@@ -1,16 +1,15 @@
 // The table of runs: filter, sort, the columns in which they differ, tags and notes; and chosen runs with their curves.
 
 import { h, replace, link, section, empty, say } from './dom.js';
-import { about, address, dataName, nameOf, place, remember, runs } from './store.js';
+import { about, address, nameOf, place, remember, runs } from './store.js';
 import { parse, matches } from './filter.js';
 import { curvePanel } from './curves.js';
-import { ago, bestOf, better, date, duration, DASH, metricNumber, metricText, metricWords, number, shortKeys, word } from './format.js';
+import { ago, bestOf, better, date, duration, DASH, metricNumber, metricWords, number, shortKeys, word } from './format.js';
 
 const STEP = 150; // rows that are drawn at once
 const KEYS = 6; // config columns that are shown by default
 const METRICS = ['stream.rotation.MPJPE', 'stream.rotation.MPJRE', 'stream.rotation.MPJVE', 'stream.rotation.Jitter', 'latency.median_ms'];
 const NARROW = matchMedia('(max-width: 640px)'); // errors come before keys on a narrow screen
-const KINDS = [['memmlp', 'Networks'], ['vqvae', 'VQ-VAEs'], ['', 'All']];
 export const ACTIVE = ['training', 'evaluating', 'exporting'];
 export const FINISHED = ['done', 'trained'];
 const STATES = [...ACTIVE, ...FINISHED, 'failed', 'lost', 'stopped', 'new'];
@@ -64,49 +63,37 @@ export async function page(name, route) {
   const chips = h('div', { class: 'chips', role: 'group', 'aria-label': 'Status' });
   const table = h('table', { class: 'runs' });
   const more = h('button', { type: 'button', class: 'more', onclick: () => { ui.drawn += STEP * 4; body(); } });
-  const compare = h('a', { class: 'button', 'aria-disabled': 'true' }, 'Compare');
-  const columns = h('select', { 'aria-label': 'Add or remove a column', onchange: () => toggleColumn(columns.value) });
+  const compare = h('button', { type: 'button', class: 'primary', title: 'Choose runs in the first column', onclick: () => { location.hash = address('compare', '', { runs: place().query.get('sel') }); } });
   const set = changes => { remember(changes); draw(); };
   const filter = h('input', {
     type: 'search', id: 'filter', spellcheck: false, autocomplete: 'off', placeholder: 'memory=gru stream.MPJPE<6.3, or words',
     oninput: () => { ui.drawn = STEP; set({ filter: filter.value }); },
   });
-  const kind = h('select', { 'aria-label': 'Kind of runs', onchange: () => set({ kind: kind.value === 'memmlp' ? '' : kind.value || 'all' }) }, KINDS.map(([value, text]) => h('option', { value }, text)));
   const scroll = h('div', { class: 'scroll tall' }, table, more);
   const nothing = h('div');
-  new IntersectionObserver(([entry]) => { if (entry.isIntersecting && !more.hidden) more.click(); }, { root: scroll, rootMargin: '600px' }).observe(more);
 
   function draw() {
     const { query } = place();
-    const settings = { text: query.get('filter') ?? '', sort: query.get('sort') ?? '-started', status: query.get('status') ?? '', kind: query.get('kind') === 'all' || only ? '' : query.get('kind') ?? 'memmlp' };
+    const settings = { text: query.get('filter') ?? '', sort: query.get('sort') ?? '-started', status: query.get('status') ?? '' };
     if (filter.value !== settings.text) filter.value = settings.text;
-    kind.value = settings.kind;
     const tests = parse(settings.text);
-    const found = [...runs.values()].filter(run => (!only || only.includes(run.id)) && (!settings.kind || run.kind === settings.kind || (run.damage.length && !run.kind)) && matches(tests, run));
+    const found = [...runs.values()].filter(run => (!only || only.includes(run.id)) && matches(tests, run));
     ui.list = sorted(settings.status ? found.filter(run => run.status === settings.status) : found, settings.sort);
-    ui.auto = differing(ui.list, about.keys);
     ui.data = [...new Set(ui.list.filter(run => FINISHED.includes(run.status)).map(run => run.data))];
-    const metrics = settings.kind === 'vqvae' ? about.metrics.filter(one => one.startsWith('vqvae.')).slice(0, 5) : only ? about.metrics.filter(one => !one.includes('GT ')) : METRICS;
+    const networks = ui.list.filter(run => run.kind === 'memmlp'); // a VQ-VAE has few of their keys
+    const metrics = !networks.length ? about.metrics.filter(one => one.startsWith('vqvae.')).slice(0, 5) : only ? about.metrics.filter(one => !one.includes('GT ')) : METRICS;
     const measured = metrics.filter(one => ui.list.some(run => typeof run.metrics[one] === 'number'));
-    const groups = [only ? ui.auto : ui.auto.slice(0, KEYS), measured];
-    ui.columns = query.get('cols') === null ? (NARROW.matches ? groups.reverse() : groups).flat() : query.get('cols').split('|').filter(Boolean);
+    const groups = [differing(networks.length ? networks : ui.list, about.keys).slice(0, only ? undefined : KEYS), measured];
+    ui.columns = (NARROW.matches ? groups.reverse() : groups).flat();
     drawStates(found, settings.status);
-    drawDataSets();
     head(settings.sort);
     body();
-    menu();
     selection();
     replace(counted, `${number(ui.list.length)} of ${number(runs.size)} runs`);
+    replace(dataSets, ui.data.length > 1 ? `On ${ui.data.length} data sets, whose errors are not comparable; filter by one: ${ui.data.slice(0, 5).map(data => `data=${data}`).join(', ')}` : null);
     scroll.hidden = !ui.list.length;
-    replace(nothing, ui.list.length ? null : runs.size ? noMatch(settings) : noRuns());
-  }
-
-  function noMatch(settings) {
-    return empty('No run matches.', h('p', {}, 'Filter: ', h('code', {}, settings.text || settings.status || 'kind')), h('button', { type: 'button', onclick: () => set({ filter: '', status: '', kind: 'all' }) }, 'Show all runs'));
-  }
-
-  function noRuns() {
-    return empty('There are no runs yet.', h('p', {}, 'They appear here as soon as one starts:'), h('pre', {}, 'memmlp demo\nmemmlp train data=synth profile=tiny'), h('p', { class: 'faint' }, `Searched in: ${about.outputs}/runs`));
+    replace(nothing, ui.list.length ? null : runs.size ? empty('No run matches.', h('button', { type: 'button', onclick: () => set({ filter: '', status: '' }) }, 'Show all runs'))
+      : empty('There are no runs yet.', h('p', {}, 'They appear here as soon as one starts:'), h('pre', {}, 'memmlp demo\nmemmlp train data=synth profile=tiny'), h('p', { class: 'faint' }, `Searched in: ${about.outputs}/runs`)));
   }
 
   function drawStates(found, status) {
@@ -114,13 +101,6 @@ export async function page(name, route) {
     const known = STATES.filter(name => count(name) || name === status);
     replace(chips, [['', 'all', found.length], ...known.map(name => [name, STATE_WORDS[name] ?? name, count(name)])].map(([name, text, many]) =>
       h('button', { type: 'button', class: `chip ${name}`, 'aria-pressed': String(name === status), onclick: () => set({ status: name }) }, text, h('b', {}, number(many)))));
-  }
-
-  // Errors on several data sets are not comparable: offer to filter by one.
-  function drawDataSets() {
-    const choose = data => set({ filter: `${place().query.get('filter') ?? ''} data=${data}`.trim() });
-    const buttons = ui.data.slice(0, 5).map(data => h('button', { type: 'button', class: 'small', onclick: () => choose(data) }, dataName(data) || 'unknown', ' ', h('small', {}, number(ui.list.filter(run => run.data === data).length))));
-    replace(dataSets, ui.data.length > 1 ? [`On ${ui.data.length} data sets, whose errors are not comparable: `, buttons] : null);
   }
 
   function head(sort) {
@@ -176,37 +156,18 @@ export async function page(name, route) {
       h('td', { class: 'n faint', title: date(run.started) }, ago(run.started)), h('td', { class: 'n faint' }, duration(run.seconds)));
   }
 
-  function menu() {
-    if (document.activeElement === columns) return; // it may be open
-    const option = (name, text = name) => h('option', { value: name }, ui.columns.includes(name) ? `✓ ${text}` : text);
-    const others = about.keys.filter(key => !ui.auto.includes(key));
-    replace(columns, h('option', { value: '' }, 'Columns'), h('option', { value: 'default' }, 'Default columns'),
-      [...ui.auto, ...others].map(key => option(key)), about.metrics.map(name => option(name, metricText(name))));
-  }
-
-  function toggleColumn(name) {
-    columns.blur();
-    const next = ui.columns.includes(name) ? ui.columns.filter(one => one !== name) : [...ui.columns, name];
-    const order = [...ui.auto, ...about.keys, ...about.metrics];
-    set({ cols: name === 'default' ? '' : next.sort((a, b) => order.indexOf(a) - order.indexOf(b)).join('|') });
-  }
-
   function selection() {
-    const ids = [...chosen].filter(id => runs.has(id)).slice(0, 60).join(',');
-    const count = ids && ids.split(',').length;
-    remember({ sel: ids });
-    compare.textContent = count ? `Compare ${count}` : 'Compare';
-    compare.setAttribute('aria-disabled', String(!count));
-    compare.title = count ? '' : 'Choose runs in the first column';
-    if (count) compare.setAttribute('href', address('compare', '', { runs: ids }));
-    else compare.removeAttribute('href');
+    const ids = [...chosen].filter(id => runs.has(id)).slice(0, 60);
+    remember({ sel: ids.join(',') });
+    compare.textContent = ids.length ? `Compare ${ids.length}` : 'Compare';
+    compare.disabled = !ids.length;
     for (const row of table.tBodies[0]?.rows ?? []) row.classList.toggle('chosen', chosen.has(row.querySelector('input').dataset.run));
   }
 
   const title = only ? `${only.length} runs` : 'Runs';
   const element = h('div', { class: 'page wide' },
     only && h('p', { class: 'trail' }, link('#/runs', 'Runs')),
-    h('div', { class: 'bar' }, h('h1', {}, title), counted, h('label', { class: 'search' }, h('span', { class: 'hidden' }, 'Filter of runs'), filter), kind, columns, compare),
+    h('div', { class: 'bar' }, h('h1', {}, title), counted, h('label', { class: 'search' }, h('span', { class: 'hidden' }, 'Filter of runs'), filter), compare),
     h('div', { class: 'bar' }, chips, dataSets), scroll, nothing, panel && section('Curves', panel.element));
   async function update() {
     draw();

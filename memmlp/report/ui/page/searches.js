@@ -1,6 +1,6 @@
 // Searches: their history, the importance of their keys, the Pareto front, and all trials.
 
-import { h, replace, link, section, empty, select, table } from './dom.js';
+import { cards, h, replace, link, section, empty, select, table } from './dom.js';
 import { address, ask, place, remember, runs } from './store.js';
 import { scatter } from './charts.js';
 import { number, shortKeys, word } from './format.js';
@@ -19,10 +19,8 @@ export async function page() {
   async function update() {
     const { searches } = await ask('searches');
     const summary = search => (search.error ? h('span', { class: 'state failed' }, search.error) : h('span', {}, search.best?.length ? [h('b', { class: 'n' }, values(search.best[0])), ' best · '] : null, h('small', { class: 'faint' }, counts(search))));
-    const list = searches.map(search => h('li', {}, h('a', { class: 'card', href: address('search', search.name) }, h('span', { class: 'card-title' }, search.title),
-      h('span', { class: 'faint' }, [search.name, search.objectives?.join(', ')].filter(Boolean).join(' · ')), summary(search))));
-    replace(element, h('div', { class: 'bar' }, h('h1', {}, 'Searches'), h('p', { class: 'count' }, number(searches.length))),
-      list.length ? h('ul', { class: 'cards' }, list) : empty('There are no searches yet.', h('p', {}, 'A search over the loss weights, or any keys:'), h('pre', {}, 'memmlp tune data=mocap data.root=FOLDER search.n_trials=30')));
+    replace(element, cards('Searches', searches.map(search => [address('search', search.name), search.title, [search.name, search.objectives?.join(', ')].filter(Boolean).join(' · '), summary(search)]),
+      empty('There are no searches yet.', h('p', {}, 'A search over the loss weights, or any keys:'), h('pre', {}, 'memmlp tune data=mocap data.root=FOLDER search.n_trials=30'))));
   }
   await update();
   return { title: 'Searches', element, update };
@@ -32,7 +30,7 @@ export async function single(name) {
   const element = h('div', { class: 'page' });
   async function update() {
     const search = await ask(`searches/${name}`);
-    replace(element, h('p', { class: 'trail' }, link('#/searches', 'Searches')), h('div', { class: 'bar title' }, h('h1', {}, search.title)),
+    replace(element, h('p', { class: 'trail' }, link('#/searches', 'Searches')), h('div', { class: 'bar' }, h('h1', {}, search.title)),
       search.error ? h('p', { class: 'warning' }, search.error) : body(search, update));
   }
   await update();
@@ -55,9 +53,8 @@ function body(search, update) {
     if (improves) least = value;
     return { ...trial, x: trial.number, y: value, best: improves };
   });
-  const meter = share => h('td', { class: 'meter' }, h('i', { style: `width:${100 * share}%` }));
   const importance = search.too_few ? h('p', { class: 'faint' }, search.too_few) : search.importance.length
-    ? [h('p', { class: 'faint' }, `${search.importance_is}, by ${search.objectives[0]}`), table(null, search.importance.map(([key, share]) => [short.get(key), meter(share), number(share, 2)]))] : null;
+    ? [h('p', { class: 'faint' }, `${search.importance_is}, by ${search.objectives[0]}`), table(null, search.importance.map(([key, share]) => [short.get(key), number(share, 2)]))] : null;
   return [
     h('div', { class: 'sum' }, h('p', {}, counts(search)), h('p', { class: 'best' }, best.length === 1 ? 'Best: ' : 'On the Pareto front: ', best.slice(0, 8).map((trial, i) => [i ? ', ' : '', runLink(trial), ' ', h('b', { class: 'n' }, values(trial))])), search.ends.map(line => h('p', { class: 'faint' }, line))),
     search.objectives.length > 1 ? h('div', { class: 'tools' }, select('Objective', search.objectives.map(one => [one, one]), objective, value => { remember({ objective: value }); update(); })) : null,

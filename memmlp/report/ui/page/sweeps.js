@@ -1,6 +1,6 @@
 // Sweeps: their progress, their effects and tables beside the paper's, and curves by variant.
 
-import { h, replace, link, section, empty, choice, table } from './dom.js';
+import { cards, h, replace, link, section, empty, table, select } from './dom.js';
 import { address, ask, generated, inFile, nameOf, place, remember, runs } from './store.js';
 import { curvePanel } from './curves.js';
 import { forest, frontier } from './charts.js';
@@ -14,10 +14,7 @@ export async function page() {
   async function update() {
     const { sweeps, damaged } = await ask('sweeps');
     const warnings = Object.entries(damaged).map(([name, why]) => h('p', { class: 'warning' }, h('b', {}, `${name}: `), why));
-    const list = sweeps.map(sweep => h('li', {}, h('a', { class: 'card', href: address('sweep', sweep.name) },
-      h('span', { class: 'card-title' }, sweep.title), h('span', { class: 'faint' }, `${sweep.name} · ${sweep.variants} variants × ${sweep.seeds} seeds`), progress(sweep))));
-    replace(element, h('div', { class: 'bar' }, h('h1', {}, 'Sweeps'), h('p', { class: 'count' }, number(sweeps.length))), warnings,
-      list.length ? h('ul', { class: 'cards' }, list) : noSweeps());
+    replace(element, cards('Sweeps', sweeps.map(sweep => [address('sweep', sweep.name), sweep.title, `${sweep.name} · ${sweep.variants} variants × ${sweep.seeds} seeds`, progress(sweep)]), noSweeps()), warnings);
   }
   await update();
   return { title: 'Sweeps', element, update };
@@ -43,8 +40,8 @@ export async function single(name) {
   const top = h('div');
   const element = h('div', { class: 'page' }, top, ids.length ? section('Curves by variant', panel.element) : null, notes(sweep.table));
   function draw() {
-    replace(top, h('p', { class: 'trail' }, link('#/sweeps', 'Sweeps')), h('div', { class: 'bar title' }, h('h1', {}, sweep.table.caption)),
-      sweep.name === sweep.table.caption ? null : h('p', { class: 'faint sub' }, sweep.name), sweep.counts.done === sweep.tasks ? null : progress(sweep), sweep.cells.length ? board(sweep) : null,
+    replace(top, h('p', { class: 'trail' }, link('#/sweeps', 'Sweeps')), h('div', { class: 'bar' }, h('h1', {}, sweep.table.caption)),
+      sweep.name === sweep.table.caption ? null : h('p', { class: 'faint' }, sweep.name), sweep.counts.done === sweep.tasks ? null : progress(sweep), sweep.cells.length ? board(sweep) : null,
       effects(sweep.table, draw), frontiers(sweep.table), section('Table', results(sweep.table)), sweep.rounds ? rounds(sweep.rounds) : null);
   }
   async function update() {
@@ -61,15 +58,14 @@ export async function single(name) {
 export async function tables() {
   const { sweeps } = await ask('sweeps');
   const pages = await Promise.all(sweeps.map(sweep => ask(`sweeps/${sweep.name}`)));
-  const contents = h('ol', {}, pages.map(one => h('li', {}, h('a', { href: address('sweep', one.name), onclick: event => { event.preventDefault(); document.getElementById(`table-${one.name}`).scrollIntoView(); } }, one.table.caption))));
   const part = one => {
     const own = h('section', { id: `table-${one.name}` });
     const draw = () => replace(own, h('h2', {}, link(address('sweep', one.name), one.table.caption)), results(one.table), effects(one.table, draw, 'h3'), notes(one.table, 'h3'));
     draw();
     return own;
   };
-  const element = h('div', { class: 'page' }, h('h1', {}, 'Tables'), generated ? h('p', { class: 'faint sub' }, generated) : null,
-    pages.length ? [h('details', { open: pages.length < 6 }, h('summary', {}, 'Contents'), contents), pages.map(part)] : noSweeps());
+  const element = h('div', { class: 'page' }, h('h1', {}, 'Tables'), generated ? h('p', { class: 'faint' }, generated) : null,
+    pages.length ? pages.map(part) : noSweeps());
   return { title: 'Tables', element };
 }
 
@@ -120,7 +116,7 @@ function effects(found, draw, head = 'h2') {
   const note = [`Difference from ‘${found.control}’, or from the variant’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction.`,
     rows.some(row => row.paper !== null) && [' ', h('span', { class: 'diamond' }, '◇'), ' the paper’s difference.'], { lower: ' Left is better.', higher: ' Right is better.' }[found.better[metric]], ' The band is the smallest effect of interest.'];
   return h('section', {}, h(head, {}, 'Effects'),
-    h('div', { class: 'tools' }, choice('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), found.modes.length > 1 ? choice('Mode', found.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
+    h('div', { class: 'tools' }, select('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), found.modes.length > 1 ? select('Mode', found.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
     h('p', { class: 'faint' }, note), forest(rows, { label: found.headings[metric].replace(/ ↓| ↑/, ''), smallest: found.smallest[metric] }));
 }
 
