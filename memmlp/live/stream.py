@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.live.rotations import BodyTree, matrix_to_quaternion, sixd_to_matrix
 from memmlp.live.spaces import SpaceName, find_space
-from memmlp.live.tracker_input import OddSamples, TrackerPose, check_time, read_trackers
+from memmlp.live.tracker_input import OddSamples, TrackerPose, TrackerReader, check_time
 from memmlp.live.tracker_resampling import (
     TRACKERS,
     UPRIGHT,
@@ -157,6 +157,7 @@ class Stream:
         wearer: the user's height and floor (`memmlp.live.wearer`). `fit` changes them.
         step_seconds: computation time of the network in the last `step`, summed over the sample's frames.
         odd: warns about implausible units and times (`SampleWarning`), once per kind.
+        reader: reads the trackers, and finds the lost ones.
 
     Raises:
         InputError: if an argument is invalid.
@@ -188,6 +189,7 @@ class Stream:
         self.step_seconds = 0.0
         self.odd = OddSamples()
         self._output = ROTATION_FORMATS[rotations]
+        self.reader = TrackerReader(self.network.fps)
         self._trackers = TrackerFrames(self.network.body, self.network.fps)
         self._features = FeatureWriter()
         self._sparse = self.network.sparse[0]  # the network's input array; written before each step
@@ -216,6 +218,7 @@ class Stream:
 
     def reset(self) -> None:
         """Restart the stream. The next sample counts as the first sample."""
+        self.reader.reset()
         self._trackers.reset()
         self._restart()
 
@@ -226,8 +229,8 @@ class Stream:
 
         Args:
             head, left, right: (position (3,) in metres, rotation (4,) xyzw or (3, 3)), or None for a lost
-                tracker. A tracker also counts as lost if it contains NaN or numbers above 1e6, or if its
-                quaternion is zero.
+                tracker. A tracker also counts as lost with NaN, numbers above 1e6, a position of zeros, a
+                rotation of zeros, or the same pose for half a second while another tracker moves.
             time: the sample's time, seconds of any clock; None for one frame after the previous sample.
 
         Returns:
@@ -253,7 +256,7 @@ class Stream:
     ) -> BodyFrame:
         """Process one sample like `step`, and return the newest frame in AMASS' conventions."""
         check_time(time)
-        positions, rotations, lost = read_trackers((head, left, right))
+        positions, rotations, lost = self.reader.take((head, left, right), time)
         if self.offsets is not None:
             positions = positions + (rotations @ self.offsets.positions[:, :, None])[..., 0]
             rotations = rotations @ self.offsets.rotations
@@ -329,7 +332,7 @@ class Stream:
                 hands, or a device more than 25 cm from its joint in a T-pose. The stream keeps its old
                 offsets.
         """
-        positions, rotations, lost = read_trackers((head, left, right))
+        positions, rotations, lost = self.reader.read((head, left, right))
         if any(lost):
             raise InputError(f"calibrate: needs all three trackers; lost: {', '.join(_list_lost(lost))}")
         world = self.wearer.scale_to_network(self.space.convert_positions_to_amass(positions))

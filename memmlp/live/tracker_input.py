@@ -16,6 +16,7 @@ from memmlp.live.tracker_resampling import GAP, TRACKERS, Lost
 from memmlp.live.wearer import check_rotations
 
 FARTHEST = 1e6  # metres; a tracker farther from the origin counts as lost
+FROZEN = GAP  # seconds; a tracker that repeats its pose for longer, while another moves, counts as lost
 LATEST = 1e10  # seconds; floats of much later times cannot resolve frames of 1/60 s
 UNIT = 1e-2  # how far a quaternion's norm may be from 1
 NEUTRAL = np.concatenate([np.zeros(3), np.eye(3).reshape(9)])
@@ -32,10 +33,73 @@ class SampleWarning(UserWarning):
     """A warning about samples that are probably not in metres, seconds or quaternions xyzw."""
 
 
-def read_trackers(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray, Lost]:
-    """Convert a user's trackers to positions (3, 3), rotations (3, 3, 3) and lost flags.
+def find_lost(poses: np.ndarray, still: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return which trackers are lost. `isLost` in the web page's stream.js follows the same rules.
 
-    A lost tracker gets the identity as its pose. Raises InputError if a tracker is malformed.
+    Programs report a lost tracker in different ways: without a pose, as NaN, far away, at the exact origin,
+    without a rotation, or with its last pose repeated.
+
+    Args:
+        poses: position and rotation matrix of each tracker (n, 12); NaN without a pose.
+        still: how long each tracker has repeated its pose while another tracker moved (n,), seconds.
+    """
+    has_pose = (np.abs(poses) <= FARTHEST).all(1) & poses[:, :3].any(1) & poses[:, 3:].any(1)
+    lost: np.ndarray = ~has_pose | (np.asarray(still) > FROZEN)
+    return lost
+
+
+class TrackerReader:
+    """Reads the samples of three trackers.
+
+    Args:
+        fps: samples per second, for samples without a time.
+
+    Attributes:
+        still: how long head, left and right have repeated their poses while another tracker moved, seconds.
+    """
+
+    def __init__(self, fps: float):
+        self.period = 1 / fps
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self.still, self.last, self.time = np.zeros(3), np.full((3, 12), np.nan), -math.inf
+
+    def take(
+        self, trackers: Sequence[TrackerPose], time: float | None
+    ) -> tuple[np.ndarray, np.ndarray, Lost]:
+        """Read a sample at a time (seconds, or None for the next frame); see `read`."""
+        poses, norms = _read_poses(trackers)
+        elapsed = self.period if time is None else time - self.time
+        moved = (poses != self.last).any(1) & ~find_lost(poses)
+        self.still = np.where(moved, 0, self.still + moved.any() * (elapsed if 0 < elapsed <= GAP else 0))
+        self.last[moved] = poses[moved]
+        self.time = self.time + self.period if time is None else time
+        return self._check(poses, norms)
+
+    def read(self, trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray, Lost]:
+        """Convert trackers to positions (3, 3), rotations (3, 3, 3) and lost flags, without counting them.
+
+        A lost tracker gets the identity as its pose. Raises InputError if a tracker is malformed.
+        """
+        return self._check(*_read_poses(trackers))
+
+    def _check(self, poses: np.ndarray, norms: np.ndarray) -> tuple[np.ndarray, np.ndarray, Lost]:
+        lost = find_lost(poses, self.still)
+        for name, norm in zip(TRACKERS, norms.tolist(), strict=True):
+            if abs(norm - 1) > UNIT and UNIT <= norm < math.inf:
+                raise InputError(f"{name}: quaternion has norm {norm:.3g}; must be 1 (xyzw)")
+        poses[lost] = NEUTRAL
+        positions, rotations = poses[:, :3], poses[:, 3:].reshape(3, 3, 3)
+        check_rotations(list(TRACKERS), rotations)
+        return positions, rotations, tuple(lost.tolist())
+
+
+def _read_poses(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and matrices (3, 12), and the norms of quaternions (3,), 1 for matrices.
+
+    A lost tracker may have NaN, also as its norm. Raises InputError for another shape.
     """
     poses, quaternions = np.full((3, 12), np.nan), {}
     for index, (name, tracker) in enumerate(zip(TRACKERS, trackers, strict=True)):
@@ -56,29 +120,13 @@ def read_trackers(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarr
             quaternions[index] = rotation
         else:
             poses[index, 3:] = rotation.reshape(9)
+    norms = np.ones(3)
     if quaternions:
-        poses[list(quaternions), 3:] = _to_matrices(quaternions).reshape(-1, 9)
-    lost = tuple((~(np.abs(poses) <= FARTHEST).all(1)).tolist())
-    if any(lost):
-        poses[list(lost)] = NEUTRAL
-    positions, rotations = poses[:, :3], poses[:, 3:].reshape(3, 3, 3)
-    check_rotations(list(TRACKERS), rotations)
-    return positions, rotations, lost
-
-
-def _to_matrices(quaternions: dict[int, np.ndarray]) -> np.ndarray:
-    """Convert trackers' quaternions (4,), xyzw, to matrices (n, 3, 3).
-
-    Quaternions of zeros become NaN, because runtimes return them for lost trackers. Raises InputError if a
-    norm is not 1.
-    """
-    array = np.array(list(quaternions.values()))
-    norms = np.sqrt(np.einsum("ni,ni->n", array, array))
-    for index, norm in zip(quaternions, norms.tolist(), strict=True):
-        if abs(norm - 1) > UNIT and norm != 0 and math.isfinite(norm):
-            raise InputError(f"{TRACKERS[index]}: quaternion has norm {norm:.3g}; must be 1 (xyzw)")
-    norms[norms == 0] = np.nan
-    return quaternion_to_matrix(array / norms[:, None])
+        array, indices = np.array(list(quaternions.values())), list(quaternions)
+        norms[indices] = found = np.sqrt(np.einsum("ni,ni->n", array, array))
+        found = np.where((found >= UNIT) & np.isfinite(found), found, np.nan)  # zeros are not a rotation
+        poses[indices, 3:] = quaternion_to_matrix(array / found[:, None]).reshape(-1, 9)
+    return poses, norms
 
 
 def check_time(time: float | None) -> None:

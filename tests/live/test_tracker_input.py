@@ -10,7 +10,7 @@ import pytest
 import memmlp
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import matrix_to_quaternion
-from memmlp.live.tracker_input import JUMPS, STILL, OddSamples, check_time, read_trackers
+from memmlp.live.tracker_input import JUMPS, STILL, OddSamples, TrackerReader, check_time
 from memmlp.live.tracker_resampling import UPRIGHT
 
 ONE = ([0, 0, 1.6], np.eye(3))
@@ -85,13 +85,13 @@ def test_a_stream_warns_at_the_line_of_its_caller(step_files):
 @pytest.mark.parametrize(("tracker", "words"), [
     (([0, 0], np.eye(3)), "position has shape .2,."),
     (([0, 0, 0], np.eye(4)), "rotation has shape .4, 4."),
-    (([0, 0, 0], [0, 0, 0, 2]), "quaternion has norm 2;"),
-    (([0, 0, 0], 2 * np.eye(3)), ".*not orthonormal"), (([0, 0, 0], np.diag([1, 1, -1])), ".*mirrors"),
+    (([0, 0, 1], [0, 0, 0, 2]), "quaternion has norm 2;"),
+    (([0, 0, 1], 2 * np.eye(3)), ".*not orthonormal"), (([0, 0, 1], np.diag([1, 1, -1])), ".*mirrors"),
     ("no", "expected .position, rotation."), (([0, 0, 0],), "expected .position, rotation."),
 ])  # fmt: skip
 def test_bad_trackers_are_rejected(tracker, words: str):
     with pytest.raises(InputError, match=f"left: {words}"):
-        read_trackers((ONE, tracker, ONE))
+        TrackerReader(60).read((ONE, tracker, ONE))
 
 
 def test_bad_times_are_rejected():
@@ -99,3 +99,47 @@ def test_bad_times_are_rejected():
     for time in (float("nan"), 1e20, -math.inf, "1.0", [1]):
         with pytest.raises(InputError, match="time="):
             check_time(time)
+
+
+NAN, IDENTITY = math.nan, [0, 0, 0, 1]
+POSES = [
+    (True, None), (True, [[0, 0, 0], [0, 0, 0, 0]]), (True, [[NAN] * 3, [NAN] * 4]),
+    (True, [[None] * 3, [None] * 4]), (True, [[0.7, None, 0], IDENTITY]),
+    (True, [[0.7, 1.4, 0], [0, 0, 0, 0]]), (True, [[0, 0, 0], IDENTITY]), (True, [[2e6, 0, 0], IDENTITY]),
+    (True, [[0.7, 1.4, 0], [0, NAN, 0, 1]]), (True, [[0.7, math.inf, 0], IDENTITY]),
+    (True, [[0.7, 1.4, 0], [0, 0, 0, 1e-3]]), (False, [[0.7, 1.4, 0], IDENTITY]),
+    (False, [[0, 1e-4, 0], [0, 1, 0, 0]]), (False, [[0, 0, 1.4], [0.5, 0.5, 0.5, -0.5]]),
+]  # fmt: skip
+"""Whether a pose is lost, and the pose: position and quaternion."""
+
+
+@pytest.mark.parametrize(("is_lost", "pose"), POSES)
+def test_what_programs_send_for_a_lost_tracker_is_lost(is_lost: bool, pose):
+    for place in range(3):
+        trackers = [ONE, ONE, ONE]
+        trackers[place] = pose
+        positions, _, lost = TrackerReader(60).read(trackers)
+        assert lost == tuple(is_lost and index == place for index in range(3))
+        assert np.isfinite(positions).all()
+    assert TrackerReader(60).read((ONE, ([0, 0, 1.4], np.zeros((3, 3))), ONE))[2] == (False, True, False)
+
+
+def test_a_tracker_that_repeats_its_pose_while_another_moves_is_lost():
+    """Not when all are still, and not where a slow tracker repeats some samples."""
+
+    def frozen(moves: Iterable[tuple[bool, bool, bool]], hz: float = 60) -> list[tuple[bool, ...]]:
+        reader, steps, found = TrackerReader(60), np.zeros(3), []
+        for index, move in enumerate(moves):
+            steps = steps + move
+            trackers = [([0.1 * step, k, 1], np.eye(3)) for k, step in enumerate(steps.tolist())]
+            found.append(reader.take(trackers, index / hz)[2])
+        return found
+
+    for place in range(3):
+        others = tuple(index != place for index in range(3))
+        found = frozen([(True, True, True)] * 9 + [others] * 60 + [(True, True, True)])
+        assert found.index(tuple(not moves for moves in others)) in (39, 40)  # after half a second
+        assert not any(found[-1])
+    assert not any(map(any, frozen([(False, False, False)] * 200 + [(True, False, False)] * 20)))
+    assert not any(map(any, frozen((True, index % 4 == 0, True) for index in range(200))))
+    assert frozen([(True, False, True)] * 2, hz=1)[-1] == (False, False, False)  # a gap is not a second of it

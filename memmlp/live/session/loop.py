@@ -263,10 +263,11 @@ class Fitting:
             self.height = value
             return f"Calibrate again: {FORGOTTEN}." if calibrated and stream.offsets is None else ""
         if command.action == "touch_floor" and trackers:
-            hands = [tracker[0] for tracker in trackers[1:] if tracker is not None]
-            if not hands:
+            positions, _, lost = stream.reader.read(trackers)
+            if all(lost[1:]):
                 raise InputError("floor: no hand is tracked; touch the floor with a tracked hand")
-            value = round(min(float(stream.space.convert_positions_to_amass(hand)[2]) for hand in hands), 4)
+            heights = stream.space.convert_positions_to_amass(positions)[1:, 2]
+            value = round(float(heights[~np.array(lost[1:])].min()), 4)
         if command.action in ("floor", "touch_floor"):
             stream.fit(self.height, value or 0.0)
             return f"The floor is at {100 * (value or 0.0):.0f} cm."

@@ -8,8 +8,9 @@ and a unit quaternion. A JSON example:
 An OSC bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right` (seven floats each),
 `/memmlp/time` (a double or float) and `/memmlp/seq` (an integer).
 
-A tracker is lost if it is null or missing. A packet without a time gets its arrival time. `seq` is the number
-of the sample. It serves to count missing packets, and to drop packets that arrive out of order.
+A tracker is lost if it is null or missing, or by the rules of `memmlp.live.tracker_input.find_lost`. In OSC,
+a message without numbers is null. A packet without a time gets its arrival time. `seq` is the number of the
+sample. It serves to count missing packets, and to drop packets that arrive out of order.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from memmlp.common.page_server import EVERYWHERE, HOST
 from memmlp.common.progress import notify
 from memmlp.live.rotations import matrix_to_quaternion, sixd_to_matrix
 from memmlp.live.spaces import SpaceName
+from memmlp.live.tracker_input import find_lost
 from memmlp.live.tracker_resampling import TRACKERS, TrackerSample, interpolate
 from memmlp.motion.body import (
     FPS,
@@ -90,13 +92,18 @@ def parse_osc_packet(datagram: bytes) -> Packet:
     logging.disable(logging.WARNING)  # the library warns about each unreadable datagram
     try:
         parts = [part for part in OscBundle(datagram) if isinstance(part, OscMessage)]
-        arguments = {part.address.removeprefix(PREFIX): list(part.params) for part in parts}
+        arguments = {part.address.removeprefix(PREFIX): _read_arguments(part) for part in parts}
     except Exception as error:  # the library raises many kinds of errors
         raise InputError(f"packet: must be an OSC bundle ({error})") from None
     finally:
         logging.disable(logging.NOTSET)
     numbers = {key: arguments[key][0] for key in ("time", "seq") if arguments.get(key)}
     return read_packet(arguments | numbers)
+
+
+def _read_arguments(message: Any) -> list[Any] | None:
+    values = list(message.params)
+    return None if all(value is None for value in values) else values
 
 
 def read_packet(fields: Mapping[str, Any]) -> Packet:
@@ -177,9 +184,13 @@ class TrackedClip:
 
     def __init__(self, name: str, frames: np.ndarray):
         self.name = name
-        frames = np.asarray(frames, np.float64)
+        frames = np.array(frames, np.float64)  # a copy, because poses of lost trackers become NaN
         self.positions = frames[:, SPARSE_POSITION].reshape(-1, 3, 3)
-        self.rotations = sixd_to_matrix(frames[:, SPARSE_ROTATION].reshape(-1, 6)).reshape(-1, 3, 3, 3)
+        with np.errstate(invalid="ignore"):  # rotations of zeros become NaN
+            self.rotations = sixd_to_matrix(frames[:, SPARSE_ROTATION].reshape(-1, 6)).reshape(-1, 3, 3, 3)
+        poses = np.concatenate([self.positions, self.rotations.reshape(-1, 3, 9)], 2)
+        lost = find_lost(poses.reshape(-1, 12)).reshape(-1, 3)
+        self.positions[lost] = self.rotations[lost] = np.nan  # so that no pose is interpolated
         self.joints = frames[:, SPARSE_DIM : SPARSE_DIM + MOTION_DIM][:, POSITION].reshape(-1, N_JOINTS, 3)
         self.seconds = (len(frames) - 1) / FPS
 

@@ -1,6 +1,7 @@
 """The loop's messages, and orders of the page: their effect on the stream, when, and what is saved."""
 
 import json
+import math
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -71,7 +72,7 @@ def test_a_calibration_waits_for_its_countdown(worn: Wearing):
 def test_a_failed_order_is_reported_and_changes_nothing(worn: Wearing):
     head, left, right = worn.pose()
     worn.order("touch_floor", 0)
-    worn.fitting.step((head, None, None))  # no hand was seen
+    worn.fitting.step((head, None, ([0, 0, 0], [0, 0, 0, 1])))  # no hand was seen
     assert worn.states[-1]["failed"]
     assert not worn.path.exists()
     worn.order("calibrate", 0)
@@ -80,6 +81,7 @@ def test_a_failed_order_is_reported_and_changes_nothing(worn: Wearing):
     for pose, words in (
         (worn.pose(shift=0.9), "head is 31 cm"),
         ((head, None, right), "left"),
+        ((head, ([math.nan] * 3, [0, 0, 0, 1]), right), "left"),
         ((head, right, left), "exchanged"),
     ):
         worn.order("calibrate", 0)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import wearer
+from live.test_tracker_input import POSES
 from live.web.conftest import RUN, Made
 from processes import finished
 
@@ -74,12 +75,30 @@ def gone(first: int, end: int, *which: int) -> dict[int, tuple[int, ...]]:
     return dict.fromkeys(range(first, end), which)
 
 
+def untracked() -> list[dict[str, Any]]:
+    """Samples in which programs report lost trackers in all ways, the head too, and two freeze."""
+    made = samples(np.arange(240) / 60)
+    lost = [
+        pose and dict(zip(("position", "rotation"), pose, strict=True)) for is_lost, pose in POSES if is_lost
+    ]
+    for index, pose in enumerate(
+        json.loads(json.dumps(lost).replace("Infinity", "NaN").replace("NaN", "null"))
+    ):
+        for sample in made[10 + 4 * index : 12 + 4 * index]:
+            sample["trackers"][index % 3] = pose
+    for index in range(100, 160):
+        made[index]["trackers"][2] = made[100]["trackers"][2]
+        made[index + 70]["trackers"][0] = made[170]["trackers"][0]
+    return made
+
+
 PARTS: dict[str, dict[str, Any]] = {
     "60 Hz": {"samples": samples(np.arange(120) / 60)}, "72 Hz": {"samples": samples(np.arange(144) / 72)},
     "50 Hz, jittered": {"samples": samples(jittered(1.6, 50.0))},
     "22 Hz": {"samples": samples(np.arange(40) / 22)},
     "lost hands": {"samples": samples(np.arange(144) / 72, {**gone(30, 70, 1), **gone(60, 100, 1, 2)})},
     "lost head": {"samples": samples(np.arange(100) / 60, {**gone(0, 12, 0, 2), **gone(50, 80, 0)})},
+    "untracked": {"samples": untracked()},
     "gaps": {"samples": samples(gaps())}, "bursts": {"samples": samples(bursts())},
     "calibrated": {"samples": samples(np.arange(90) / 90), "calibrate": t_pose(), "height": HEIGHT},
 }  # fmt: skip
@@ -101,7 +120,7 @@ def in_python(step: Path, part: dict[str, Any]) -> tuple[Stream, list[Pose]]:
     stream = Stream(step, space="openxr", height=part.get("height"))
 
     def given(trackers: list[dict[str, Any] | None]) -> list[Any]:
-        return [t and (np.array(t["position"]), np.array(t["rotation"])) for t in trackers]
+        return [t and (t["position"], t["rotation"]) for t in trackers]
 
     if "calibrate" in part:
         stream.calibrate(*given(part["calibrate"]))
@@ -142,6 +161,9 @@ def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
         made = np.array([pose[theirs] for pose in found])
         wanted = np.array([getattr(pose, ours).ravel() for pose in expected])
         np.testing.assert_allclose(made, wanted, atol=TOLERANCE)
+    if name == "untracked":
+        assert {held for pose in expected for held in pose.held} == {"head", "left", "right"}
+        assert [expected[index].held for index in (159, 229, 239)] == [("right",), ("head",), ()]
     if stream.offsets is not None:
         offsets = answers[name]["offsets"]
         np.testing.assert_allclose(offsets["positions"], stream.offsets.positions, atol=1e-9)

@@ -16,6 +16,7 @@ const MAX_WEIGHT = 1.1; // of the way between two samples; two that arrive toget
 const SAME = 1e-6; // seconds; a sample this near to a frame is the frame
 const FARTHEST = 1e6; // metres; a tracker farther from the origin is lost
 const FAR = 0.25; // metres; a device farther from a T-pose's joint is not attached there
+const FROZEN = GAP; // seconds; a tracker that repeats its pose for longer, while another moves, is lost
 const UNIT = 1e-2; // maximum difference of a quaternion's norm from 1
 const APART = 0.1; // minimum metres between the hands in a T-pose
 const TILTED = Math.PI / 3; // from upright; a device that is tilted further has no heading
@@ -135,9 +136,23 @@ export class Stream {
 
   // Restart. The next sample counts as the first sample. Its frame waits for the frames in progress.
   reset() {
+    Object.assign(this, { still: [0, 0, 0], poses: [], sampled: -Infinity });
     this.trackers.reset();
     const forget = () => null;
     this.newest = (this.newest ?? Promise.resolve()).then(forget, forget);
+  }
+
+  read(trackers) { return trackers.map((tracker, i) => read(tracker, TRACKERS[i], this.still[i])); }
+
+  // Measure how long each tracker has repeated its pose while another moved, seconds.
+  measureStill(trackers, time) {
+    const poses = trackers.map(tracker => (isLost(tracker) ? null : [...tracker.position, ...tracker.rotation].join()));
+    const moved = poses.map((pose, i) => pose !== null && pose !== this.poses[i]);
+    const elapsed = time === null ? 1 / this.trackers.fps : time - this.sampled;
+    const longer = moved.includes(true) && elapsed > 0 && elapsed <= GAP ? elapsed : 0;
+    this.still = this.still.map((seconds, i) => (moved[i] ? 0 : seconds + longer));
+    this.poses = poses.map((pose, i) => pose ?? this.poses[i]);
+    this.sampled = time ?? this.sampled + 1 / this.trackers.fps;
   }
 
   // Take one sample, { position, rotation } of each tracker or null if it is lost, at a time in seconds of any clock; without
@@ -145,7 +160,8 @@ export class Stream {
   // restarted }, positions by forward kinematics, joints of the network's position branch. Samples are processed in turn.
   step(head, left, right, time = null) {
     if (time !== null && !Number.isFinite(time)) throw new Error(`time=${time}: must be a number of seconds, or null`);
-    const devices = [head, left, right].map(read);
+    this.measureStill([head, left, right], time);
+    const devices = this.read([head, left, right]);
     const { offsets: on, scale } = this;
     const positions = devices.map(({ position, rotation }, i) =>
       scaled(on ? plus(position, rotate(rotation, on.positions[i])) : position, scale));
@@ -176,7 +192,7 @@ export class Stream {
   // gives the heading; the network's body in that pose is placed as near to the devices as possible.
   // scale: the one to use from now on, as in the constructor. An error leaves offsets and scale unchanged.
   calibrate(head, left, right, scale = this.scale) {
-    const devices = [head, left, right].map(read);
+    const devices = this.read([head, left, right]);
     const missing = TRACKERS.filter((_, i) => devices[i].lost);
     if (missing.length) throw new Error(`needs all three trackers; lost: ${missing.join(', ')}`);
     const world = devices.map(device => scaled(device.position, scale));
@@ -207,13 +223,19 @@ export class Stream {
   }
 }
 
-// A tracker with a unit quaternion; one that is null, far away, or has NaN or a quaternion of zeros is lost.
-function read(tracker, index) {
-  if (!tracker) return NEUTRAL;
-  const numbers = [...tracker.position, ...tracker.rotation];
-  if (numbers.length !== 7) throw new Error(`${TRACKERS[index]}: must be a position of 3 numbers and a rotation of 4 numbers`);
-  const norm = Math.hypot(...tracker.rotation);
-  if (norm === 0 || !numbers.every(x => Math.abs(x) <= FARTHEST)) return NEUTRAL;
-  if (Math.abs(norm - 1) > UNIT) throw new Error(`${TRACKERS[index]}: quaternion has norm ${norm.toPrecision(3)}; must be 1`);
+// Whether a tracker is lost: the same rules as memmlp.live.tracker_input.find_lost. It is null, has NaN, is far away, at the
+// exact origin or without a rotation, or it was still for some seconds in which another tracker moved.
+export function isLost(tracker, still = 0) {
+  if (!tracker || still > FROZEN) return true;
+  const { position, rotation } = tracker;
+  return ![...position, ...rotation].every(x => Number.isFinite(x) && Math.abs(x) <= FARTHEST) || !position.some(Boolean) || Math.hypot(...rotation) < UNIT;
+}
+
+// A tracker with a unit quaternion, or NEUTRAL.
+function read(tracker, name, still) {
+  if (tracker && (tracker.position.length !== 3 || tracker.rotation.length !== 4)) throw new Error(`${name}: must be a position of 3 numbers and a rotation of 4 numbers`);
+  const norm = Math.hypot(...(tracker?.rotation ?? IDENTITY));
+  if (Math.abs(norm - 1) > UNIT && norm >= UNIT && norm < Infinity) throw new Error(`${name}: quaternion has norm ${norm.toPrecision(3)}; must be 1`);
+  if (isLost(tracker, still)) return NEUTRAL;
   return { position: [...tracker.position], rotation: scaled(tracker.rotation, 1 / norm), lost: false };
 }

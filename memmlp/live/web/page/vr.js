@@ -5,7 +5,7 @@ import { kindsOf, trackersOf, usualOffsets } from './headset.js';
 import { MirrorScene } from './mirror_scene.js';
 import { openNetwork } from './network.js';
 import { headingOf } from './rotations.js';
-import { Stream } from './stream.js';
+import { isLost, Stream } from './stream.js';
 import { Facts, percentiles } from './viewer.js';
 
 const MODES = { 'immersive-vr': 'Enter VR', 'immersive-ar': 'Enter AR' };
@@ -117,7 +117,7 @@ class VrPage {
     const space = mirror.renderer.xr.getReferenceSpace();
     if (frame && space && user) {
       if (++user.frames % 20 === 0) this.facts.show(user);
-      const trackers = trackersOf(frame, space, user.session.inputSources);
+      const trackers = trackersOf(frame, space, user.session.inputSources).map(tracker => (isLost(tracker) ? null : tracker));
       this.changeDevices(kindsOf(user.session.inputSources));
       if (trackers[0] && !user.placed) this.placeMirror(trackers[0]);
       this.calibrate(trackers);
