@@ -19,6 +19,7 @@ from memmlp.runs.evaluation_file import add_solver_names
 from memmlp.runs.identity import NETWORK, NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import count_training_frames, is_trained, warn_if_hardly_trained
 from memmlp.runs.run import Run
+from memmlp.sweep.definition import MODES
 
 VIEWABLE_FILES = (
     "config.yaml", "manifest.json", "metrics.jsonl", "code.patch", "FAILED", "notes.json", "poses.png",
@@ -109,7 +110,7 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         places: the sweeps and searches by run id.
     """
     facts, run = index.runs[run_id], Run.from_id(index.outputs, run_id)
-    config = _read_flat_config(run)
+    config, clips = _read_flat_config(run), read_clips(run)
     return {
         **facts,
         "places": places.get(run_id, []),
@@ -121,7 +122,8 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
             "config": _read_flat_config(Run.from_id(index.outputs, control)),
         },
         "manifest": flatten(run.manifest),
-        "clips": read_clips(run),
+        "clips": clips,
+        "partial": count_partial_clips(clips),
         "latency": _read_latency(run),
         "changed": run.verify() if run.done else [],
         "outdated": list_outdated_modes(run),
@@ -132,6 +134,19 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
 
 def _read_flat_config(run: Run) -> dict[str, Any]:
     return make_json_safe(flatten(read_config(run)))
+
+
+def count_partial_clips(clips: Sequence[Mapping[str, Any]]) -> dict[str, list[int]]:
+    """Return [clips with a value, all clips] by name, such as "stream.rotation.Jitter", if some have none."""
+    values: dict[str, list[float]] = defaultdict(list)
+    for clip in clips:
+        reports = [(mode, branch, own) for mode in MODES for branch, own in clip.get(mode, {}).items()]
+        for mode, branch, errors in reports:
+            for metric, value in errors.items() if isinstance(errors, Mapping) else ():
+                number = math.nan if value is None else float(value)
+                values[f"{mode}.{branch}.{metric}"].append(number)
+    counts = {name: [sum(map(math.isfinite, found)), len(clips)] for name, found in values.items()}
+    return {name: both for name, both in counts.items() if both[0] < both[1]}
 
 
 def read_clips(run: Run) -> list[dict[str, Any]]:

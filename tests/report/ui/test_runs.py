@@ -10,6 +10,7 @@ from report.ui.conftest import started_run
 
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.ui.runs import (
+    count_partial_clips,
     describe_units,
     find_differing_keys,
     list_outdated_modes,
@@ -29,6 +30,14 @@ def test_one_folder_of_data_has_many_spellings():
     assert find_differing_keys([of("d", **here), of("d", **there)]) == ["seed"]
     assert find_differing_keys([of("d", **here), of("e", **there)]) == ["data.root", "seed"]
     assert find_differing_keys([of("d", **here), of("d", seed=0)]) == []
+
+
+def test_clips_without_a_value_are_counted():
+    clips = [
+        {"name": "a", "frames": 9, "stream": {"rotation": {"MPJPE": 1.0, "Jitter": value}}}
+        for value in (2, None)
+    ]
+    assert count_partial_clips(clips) == {"stream.rotation.Jitter": [1, 2]}
 
 
 def test_units_and_what_is_better_of_known_metrics():

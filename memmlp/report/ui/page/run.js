@@ -74,10 +74,12 @@ function results(run) {
   const cell = (column, metric) => {
     const value = run.metrics[`${column}.${metric}`];
     const before = other?.[`${column}.${metric}`];
-    if (value === undefined || typeof before !== 'number') return metricNumber(metric, value);
+    const part = run.partial[`${column}.${metric}`];
+    const own = [metricNumber(metric, value), part ? h('small', { class: 'faint' }, ` (${part[0]} of ${part[1]} clips)`) : null];
+    if (value === undefined || typeof before !== 'number') return own;
     const change = value - before;
     const verdict = better(metric) && (change < 0 === (better(metric) === 'lower') ? 'better' : 'worse');
-    return [metricNumber(metric, value), h('small', { class: verdict }, signed(change, effectDigits({ mean: change, value })))];
+    return [own, h('small', { class: verdict }, signed(change, effectDigits({ mean: change, value })))];
   };
   const note = other ? ' Small: the difference from the control’s run of the same seed, which is not a verdict.' : run.control && !comparable ? ' The control has other data, so its difference is not shown.' : '';
   return section('Results', h('p', { class: 'faint' }, 'Means over the test clips; arrows show what is better.', note), table(
