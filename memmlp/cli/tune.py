@@ -311,7 +311,8 @@ def print_summary(setup: SearchSetup, study: Study) -> None:
         click.echo(f"incomplete data: {part}")
     click.echo(f"in {setup.folder}")
     if best:
-        words = setup.list_overrides(get_values(best[0], setup.search))[1:]
+        unmeasured = 2 if setup.search.budget else 1  # the first overrides leave out export and evaluation
+        words = setup.list_overrides(get_values(best[0], setup.search))[unmeasured:]
         click.echo(f"next: memmlp train {shlex.join([*setup.config_options, *words])}")
     else:
         reasons = [trial.user_attrs["reason"] for trial in study.trials if "reason" in trial.user_attrs]

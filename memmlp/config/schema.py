@@ -240,7 +240,7 @@ class EvaluationConfig:
 
     # window: windows that do not overlap; stream: one frame at a time, with the network's own predictions as
     # history (docs/readings.md, no. 21)
-    modes: list[str] = setting(each(one_of("window", "stream")), ["window", "stream"])
+    modes: list[str] = setting(each(one_of("window", "stream"), empty=True), ["window", "stream"])
     batch: int = setting(at_least(1), "${profile.evaluation_batch}")  # number of clips per batch
     # lbfgs: adds the result "combined", rotations fitted to the position branch (Table 6; docs/readings.md,
     # no. 11); arms: moves the hands to their trackers

@@ -134,7 +134,8 @@ class Search:
             return ()
         branch = self.objectives[0].terms[0][1].split()[0]
         validation = "optim.validate_every=0.2", "optim.validation_pieces=32"
-        return f"optim.tflop={self.tflop}", f"optim.best_by={branch}", *validation
+        untested = "evaluation.modes=[]"  # test clips are for the chosen network
+        return untested, f"optim.tflop={self.tflop}", f"optim.best_by={branch}", *validation
 
     @staticmethod
     def overrides(values: Mapping[str, Value]) -> tuple[str, ...]:
