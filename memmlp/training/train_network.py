@@ -190,7 +190,7 @@ class MotionTask(TrainingTask):
         motion, state, losses = self.compute_training_outputs(call.sparse, call.state, call.true_frames)
         self.rollout.keep(state)
         members = len(motion) // len(call.true_frames)  # a network may return the motion of several
-        truth = call.true_frames[:, -motion.shape[1] :].repeat(members, 1, 1)
+        truth = call.true_frames[:, -motion.shape[1] :].expand(members, -1, -1, -1).flatten(0, 1)
         loss, terms = self.loss(
             motion, truth[..., SPARSE_DIM:], truth[..., :SPARSE_DIM], self.model.normalizer
         )
