@@ -1,9 +1,12 @@
 """The HTTP server of a local page: access control, files and events.
 
 At the loopback address, the Host header of a request must name that address; this prevents DNS rebinding.
-Requests from pages of other sites are refused. At any other address, each request needs the token. The
-printed address contains the token; the server then moves it to a cookie, to keep it out of the browser's
-history.
+At any other address, each request needs the token. The printed address contains the token; the server then
+moves it to a cookie, to keep it out of the browser's history. Requests from pages of other sites are refused,
+except for links to the page. These rules come before everything else.
+
+The number of connections is limited, and so is that of threads. At the limit, a new connection closes the one
+that has waited longest for a request. So clients that send slowly or nothing do not delay others.
 """
 
 from __future__ import annotations
@@ -11,10 +14,12 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import math
 import re
 import secrets
 import socket
 import threading
+import time
 import urllib.parse
 from collections.abc import Iterable, Mapping
 from email.message import Message
@@ -29,6 +34,10 @@ from memmlp.common.errors import InputError
 HOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 COOKIE = "memmlp_token"
 MIN_LENGTH = 16  # characters of a token
+MAX_CONNECTIONS, MAX_STREAMS = 100, 50  # open connections, and those of them with events
+MAX_BODY = 1000  # bytes of a request's body
+MAX_WAIT = 10.0  # seconds for a request to arrive completely
+MAX_SEND_WAIT = 60  # seconds without progress while an answer is sent
 TEXT = "text/plain; charset=utf-8"
 TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "vrm": "model/gltf-binary"}
 
@@ -78,13 +87,16 @@ class AccessRules:
     def allows(self, path: str, headers: Message, port: int) -> bool:
         """Return whether a request may be answered, judging by its host, origin and token."""
         url = urllib.parse.urlsplit(path)
-        if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-            return headers.get("Sec-Fetch-Mode") == "navigate" and url.path == "/"
         if self.token is None:
             host = headers.get("Host", "")
-            return (host.rpartition(":")[0] or host) in (HOST, "localhost", self.host)
-        given = dict(urllib.parse.parse_qsl(url.query)).get("token", "") or _read_cookie(headers, port)
-        return secrets.compare_digest(given.encode(), self.token.encode())
+            if (host.rpartition(":")[0] or host) not in (HOST, "localhost", self.host):
+                return False
+        else:
+            given = dict(urllib.parse.parse_qsl(url.query)).get("token", "") or _read_cookie(headers, port)
+            if not secrets.compare_digest(given.encode(), self.token.encode()):
+                return False
+        is_link = headers.get("Sec-Fetch-Mode") == "navigate" and url.path == "/"
+        return is_link or headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")
 
     def allows_change(self, path: str, headers: Message, port: int) -> bool:
         """Return whether a request may change data; requests from pages of other sites may not."""
@@ -120,23 +132,51 @@ class PageHandler(BaseHTTPRequestHandler):
     """Answers one request of a page; subclasses define `answer`."""
 
     server: PageServer
-    timeout = 60
+    timeout = MAX_SEND_WAIT
+    body: bytes
+
+    def handle_one_request(self) -> None:
+        """Wait for a request, and answer it."""
+        self.server.set_waiting(self.connection, time.monotonic())
+        super().handle_one_request()
+
+    def parse_request(self) -> bool:
+        """Read a request, and return whether it may be answered; otherwise, send the reason."""
+        if not super().parse_request():
+            return False
+        access, port = self.server.access, self.server.server_port
+        chunked, length = "Transfer-Encoding" in self.headers, self.headers.get("Content-Length", "0")
+        if not access.allows(self.path, self.headers, port):
+            return self._refuse(403, "access denied; open the address that the command printed")
+        if chunked or not re.fullmatch(r"[0-9]+", length):
+            return self._refuse(411, "Content-Length: must be a number of bytes")
+        if len(length) > 9 or int(length) > MAX_BODY:
+            return self._refuse(413, f"Content-Length: must be at most {MAX_BODY}")
+        self.body = self.rfile.read(int(length))
+        self.server.set_waiting(self.connection, math.inf)
+        return True
+
+    def _refuse(self, code: int, reason: str) -> bool:
+        self.close_connection = True
+        self.send(code, TEXT, f"{reason}\n".encode())
+        return False
 
     def answer(self, path: str, query: Mapping[str, str]) -> None:
         """Send the answer to an allowed GET request; `path` does not begin with a slash."""
         raise NotImplementedError
 
     def do_GET(self) -> None:
-        """Check the access rules, then answer the request."""
+        """Answer the request, or move its token to a cookie."""
         with contextlib.suppress(ConnectionError, TimeoutError):  # raised when the page was closed
             url, port = urllib.parse.urlsplit(self.path), self.server.server_port
             query = dict(urllib.parse.parse_qsl(url.query))
-            if not self.server.access.allows(self.path, self.headers, port):
-                self.send(403, TEXT, b"access denied; open the address that the command printed\n")
-            elif "token" in query:  # it moves to a cookie
+            if "token" in query:
                 cookie = f"{COOKIE}_{port}={urllib.parse.quote(query['token'])}"
-                attributes = "HttpOnly; SameSite=Strict; Path=/"
-                self.send(303, TEXT, b"", {"Location": "/", "Set-Cookie": f"{cookie}; {attributes}"})
+                headers = {"Set-Cookie": f"{cookie}; HttpOnly; SameSite=Strict; Path=/", "Location": "/"}
+                if self.headers.get("Sec-Fetch-Site") == "cross-site":  # its redirect would have no cookie
+                    self.send(200, TEXT, b"", headers | {"Refresh": "0; url=/"})
+                else:
+                    self.send(303, TEXT, b"", headers)
             else:
                 self.answer(urllib.parse.unquote(url.path).lstrip("/"), query)
 
@@ -148,9 +188,14 @@ class PageHandler(BaseHTTPRequestHandler):
     def send_events(self, events: Iterable[bytes]) -> None:
         """Send server-sent events one by one, until the events end or the page is closed."""
         self.close_connection = True
-        self._send_head(200, "text/event-stream", {"Connection": "close"})
-        for event in events:
-            self.wfile.write(event)
+        if not self.server.streams.acquire(blocking=False):
+            return self.send(503, TEXT, b"too many open pages; close some\n")
+        try:
+            self._send_head(200, "text/event-stream", {"Connection": "close"})
+            for event in events:
+                self.wfile.write(event)
+        finally:
+            self.server.streams.release()
 
     def _send_head(self, code: int, kind: str, headers: Mapping[str, str]) -> None:
         self.send_response(code)
@@ -190,12 +235,15 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
     block_on_close = False
+    request_queue_size = 128
     headers: Mapping[str, str] = {}
 
     def __init__(
         self, handler: type[PageHandler], port: int, host: str = HOST, token: str | None = None
     ) -> None:
         self.access = AccessRules(host, token)
+        self.lock, self.streams = threading.Lock(), threading.Semaphore(MAX_STREAMS)
+        self.waiting: dict[Any, float] = {}  # open connections, and since when each waits for a request
         try:
             super().__init__((host, port), handler)
         except (OSError, OverflowError) as error:
@@ -219,6 +267,44 @@ class PageServer(ThreadingHTTPServer):
         name = find_own_address() if self.server_name == EVERYWHERE else self.server_name
         token = self.access.token
         return f"http://{name}:{self.server_port}/" + (f"?token={urllib.parse.quote(token)}" if token else "")
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Start a thread for a connection. At the limit, close the connection that waits longest, or this."""
+        with self.lock:
+            full = len(self.waiting) >= MAX_CONNECTIONS
+            if full and self.waiting[oldest := min(self.waiting, key=self.waiting.__getitem__)] < math.inf:
+                self._close_connection(oldest)
+                full = False
+            if not full:
+                self.waiting[request] = time.monotonic()
+        if full:
+            self.shutdown_request(request)
+        else:
+            super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection at the end of its thread."""
+        with self.lock:
+            self.waiting.pop(request, None)
+        super().shutdown_request(request)
+
+    def set_waiting(self, connection: Any, since: float) -> None:
+        """Record since when a connection waits for a request; infinity while it is answered."""
+        with self.lock:
+            if connection in self.waiting:
+                self.waiting[connection] = since
+
+    def service_actions(self) -> None:
+        """Close connections whose requests take too long to arrive; called several times a second."""
+        with self.lock:
+            for connection, since in list(self.waiting.items()):
+                if since < time.monotonic() - MAX_WAIT:
+                    self._close_connection(connection)
+
+    def _close_connection(self, connection: Any) -> None:
+        del self.waiting[connection]
+        with contextlib.suppress(OSError):  # raised if its thread closed it
+            connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the error: an interrupted request does not affect other pages."""
@@ -244,5 +330,5 @@ def find_own_address() -> str:
         try:
             probe.connect(("192.0.2.1", 9))  # an address for documentation (RFC 5737)
         except OSError:
-            return HOST
+            return socket.gethostname()
         return str(probe.getsockname()[0])

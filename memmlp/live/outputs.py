@@ -139,7 +139,8 @@ class Receiver:
 
     def __init__(self, host: str, port: int, key: str):
         try:
-            family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+            family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)  # IPv4 first
         except (OSError, UnicodeError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"{key} {host}: {reason}; expected HOST or HOST:PORT") from None

@@ -1,6 +1,7 @@
 """Outputs: VMC and VRChat by their specifications, recorded files, and failures that stay with one output."""
 
 import errno
+import socket
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -58,6 +59,17 @@ def test_a_busy_network_drops_a_datagram_and_other_errors_are_raised():
         receiver.socket = Mock(**{"sendto.side_effect": OSError(state, "as it is")})
         with pytest.raises(OSError, match="as it is") if state == errno.ENETUNREACH else nullcontext():
             receiver.send(b"")
+
+
+def test_a_name_with_both_addresses_is_reached_by_its_ipv4_address(monkeypatch: pytest.MonkeyPatch):
+    """Programs listen there, while `localhost` is ::1 first on many machines."""
+    v6 = (socket.AF_INET6, socket.SOCK_DGRAM, 17, "", ("::1", 39539, 0, 0))
+    v4 = (socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.1", 39539))
+    for found, expected in (([v6, v4], "127.0.0.1:39539"), ([v6], "::1:39539")):
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, found=found, **__: found)
+        receiver = Receiver("localhost", 39539, "--vmc")
+        assert str(receiver) == expected
+        receiver.close()
 
 
 SECONDS, HEIGHT, FLOOR = 5, 1.86, 0.25

@@ -24,7 +24,6 @@ from memmlp.motion.formats.gltf import write_vrm
 
 QUEUED = 240  # maximum number of queued frames for a page; older frames are dropped
 QUIET = 2.0  # seconds without a frame before a comment keeps the connection alive
-LARGEST = 1000  # maximum number of bytes of a command
 PAGE = (
     "index.html", "live.css", "main.js", "viewer.js", "stage.js", "wearer.js", "avatar.js",
     "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
@@ -161,8 +160,7 @@ class LiveHandler(PageHandler):
                 code = 404
             else:
                 try:
-                    size = min(int(self.headers.get("Content-Length", 0)), LARGEST)
-                    take(json.loads(self.rfile.read(size)))
+                    take(json.loads(self.body))
                 except (ValueError, RecursionError) as error:
                     code, line = 400, str(error) if isinstance(error, InputError) else "not JSON"
             self.send(code, TEXT, line.encode())

@@ -97,7 +97,7 @@ def parse_osc_packet(datagram: bytes) -> Packet:
         raise InputError(f"packet: must be an OSC bundle ({error})") from None
     finally:
         logging.disable(logging.NOTSET)
-    numbers = {key: arguments[key][0] for key in ("time", "seq") if arguments.get(key)}
+    numbers = {key: values[0] for key in ("time", "seq") if (values := arguments.get(key))}
     return read_packet(arguments | numbers)
 
 

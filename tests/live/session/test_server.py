@@ -106,7 +106,7 @@ def test_commands_of_the_page_arrive():
         assert post(server, json.dumps(command).encode(), Origin=own) == (200, "")
         ask.assert_called_once_with(command)
         assert post(server, b'"no"') == (400, "no: not allowed")
-        for content in (b"", b"nonsense", b"[" * 900, b'"' + 2000 * b"x" + b'"', b"\xff"):
+        for content in (b"", b"nonsense", b"[" * 900, b"\xff"):
             assert post(server, content) == (400, "not JSON")
         assert post(server, b"{}", "/other")[0] == 404
         elsewhere = {"Origin": "http://elsewhere.example", "Host": "elsewhere.example"}
