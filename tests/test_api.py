@@ -61,7 +61,7 @@ def prediction(home: Path, run: memmlp.TrainedRun) -> memmlp.Prediction:
 def three(run: memmlp.TrainedRun, tmp_path: Path) -> memmlp.Runs:
     """The run and two copies of it under other ids, started later and earlier, of seeds 1 and 2."""
     shutil.copytree(run.folder, tmp_path / "runs" / run.id)
-    for seed, started in ((1, "9"), (2, "0")):
+    for seed, started in ((1, "2999-01-01"), (2, "2000-01-01")):
         folder = Path(shutil.copytree(run.folder, tmp_path / "runs" / (str(seed) * 16)))
         own = {"run": folder.name}  # what lies in a run's folder names its run
         write_json(folder / "DONE", read_json(folder / "DONE") | {"id": folder.name})

@@ -71,7 +71,8 @@ def predict(
     from memmlp.runs.lookup import find_run
 
     opened_run = find_run(outputs, run)
-    experiment = build_run_experiment(opened_run, device, [] if ik is None else [f"evaluation.ik={ik}"])
+    words = [] if ik is None else [f"evaluation.ik={ik}"]
+    experiment = build_run_experiment(opened_run, device, words, outputs)
     chosen = choose_branch(experiment.evaluation, branch)
     interpolation = experiment.motion.clips.interpolation
     predictor = ClipPredictor(

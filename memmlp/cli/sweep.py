@@ -206,12 +206,11 @@ def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, lab
     from memmlp.config.compose_plan import get_sweep_folder
     from memmlp.report.tables.build_table import write_table
     from memmlp.report.tables.measured_run import load_measured_run
+    from memmlp.sweep.plan import FAULTY
 
     plan, rounds, command = shown.plan, shown.rounds, " ".join([*arguments, *plugins.format_config_dir()])
     states = plan.read_states()
-    failed = [
-        task for task in plan.select_variants(labels).tasks if states[task.key] in ("failed", "blocked")
-    ]
+    failed = [task for task in plan.select_variants(labels).tasks if states[task.key] in FAULTY]
     found = make_plan_table(shown, SHOWN_MODES["both"], f"memmlp sweep {command}", load_measured_run)
     write_table(found.table, get_sweep_folder(chosen, plan.outputs))
     print_tables([found.table])
@@ -219,7 +218,7 @@ def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, lab
         click.echo(line)
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
     for task in failed:
-        reason = plan.get_run(task).failure or "a prerequisite run failed"
+        reason = plan.get_run(task).fault or "a prerequisite run failed"
         click.echo(f"failed: run {task.id}: {reason}", err=True)
     if failed:
         click.echo("repeat failed runs with --retry", err=True)

@@ -59,7 +59,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """
     unfinished = temporary_path(path)
     try:
-        with open(unfinished, "wb") as file:
+        with naming_file(path), open(unfinished, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -69,6 +69,17 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
             unfinished.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def naming_file(path: Path) -> Iterator[None]:
+    """Add the path to an OSError that does not name a file, such as a full disk in `write`."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -103,6 +114,6 @@ def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; empty if the file is missing or not valid JSON."""
     try:
         value = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}

@@ -41,6 +41,7 @@ from memmlp.common.errors import LeaseLost
 
 LEASE = 60.0  # seconds without a heartbeat after which other processes may take over a folder
 BEAT = 5.0  # seconds between two heartbeats
+MAX_CLAIM = 4096  # characters of a claim that are read
 PAUSE = 0.2  # seconds between two attempts to claim a folder
 
 PROC = Path("/proc")
@@ -67,7 +68,9 @@ def is_alive(process: Mapping[str, Any]) -> bool | None:
     """Return whether a process (`current_process`) is alive; None if it runs on another machine."""
     if process.get("place") != compute_process_namespace():
         return None
-    pid = int(process["pid"])
+    pid = process.get("pid")
+    if not isinstance(pid, int) or not 0 < pid < 2**31:
+        return False
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -143,7 +146,7 @@ class Claim(NamedTuple):
     @property
     def owner(self) -> dict[str, Any] | None:
         """The process that made the claim; None if the folder is free or the claim is not readable (yet)."""
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError, RecursionError):
             owner = json.loads(self.text)
             return owner if isinstance(owner, dict) and not self.free else None
         return None
@@ -217,8 +220,8 @@ class Lock:
         owner = self.owner
         if not owner:
             return "another process"
-        where = "" if owner["place"] == compute_process_namespace() else " on another machine"
-        return f"process {owner['pid']}{where} since {owner['since']}"
+        where = "" if owner.get("place") == compute_process_namespace() else " on another machine"
+        return f"process {owner.get('pid')}{where} since {owner.get('since')}"
 
     @property
     def is_held(self) -> bool | None:
@@ -246,9 +249,11 @@ class Lock:
             (number, owned), path = claims[-1]
             with (
                 contextlib.suppress(FileNotFoundError),  # it has been superseded meanwhile
-                open(path, encoding="utf-8") as file,  # on NFS, opening a file refreshes it from the server
+                open(
+                    path, encoding="utf-8", errors="replace"
+                ) as file,  # on NFS, opening a file refreshes it from the server
             ):
-                return Claim(number, not owned, file.read(), os.fstat(file.fileno()).st_mtime_ns)
+                return Claim(number, not owned, file.read(MAX_CLAIM), os.fstat(file.fileno()).st_mtime_ns)
         return None
 
     def list_claims(self) -> list[tuple[tuple[int, bool], Path]]:

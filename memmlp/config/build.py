@@ -33,7 +33,7 @@ from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.identity import VQVAE_SHAPE
 from memmlp.runs.loggers.logger import Loggers
-from memmlp.runs.lookup import check_trained
+from memmlp.runs.lookup import check_trained, find_outputs
 from memmlp.runs.run import Run
 from memmlp.training.devices import choose_device
 from memmlp.training.losses import Loss, MotionLoss, Term
@@ -245,12 +245,15 @@ def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
     return make_vqvae_optim(vqvae.steps or math.ceil(vqvae.epochs * frames / vqvae.batch), **keys)
 
 
-def load_config(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
+def load_config(run: Run, overrides: Sequence[str] = (), outputs: Path | None = None) -> DictConfig:
     """Return the typed and checked config of a finished run of a motion network.
+
+    A recorded config never decides where a command writes (`_use_outputs`).
 
     Args:
         run: the run.
         overrides: overrides KEY=VALUE of its config.
+        outputs: the folder of runs and caches; by default, the folder that contains the run.
 
     Raises:
         InputError: for an unfinished run, a config that this version cannot read, an invalid override, or a
@@ -266,10 +269,32 @@ def load_config(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
         raise InputError(
             f"{run.config_path}: this version of memmlp cannot read the config ({reason})"
         ) from None
+    _use_outputs(cfg, outputs or find_outputs(run))
     for word in overrides:
         _apply_override(cfg, word)
     check(cfg)
     return cfg
+
+
+def _use_outputs(cfg: DictConfig, outputs: Path) -> None:
+    """Replace the recorded places to write to: outputs, synthetic motion, predictions and loggers.
+
+    Recorded motion below the recorded outputs is expected at the same place below `outputs`, if it is there.
+    """
+    recorded, cfg.paths.outputs = cfg.paths.outputs, str(outputs)
+    cfg.force, cfg.save_predictions, cfg.loggers = False, None, {}
+
+    def move(path: Any) -> str | None:
+        path = Path(str(path))
+        if not path.is_relative_to(recorded) or ".." in path.parts:
+            return None
+        return str(outputs / path.relative_to(recorded))
+
+    if cfg.data.synth is not None:
+        cfg.data.root = move(cfg.data.root) or str(outputs / "data" / "synth")
+    for data in (cfg.data, *(cfg.data.get("sources") or {}).values()):
+        if (moved := move(data.root)) and Path(moved).exists():
+            data.root = moved
 
 
 def _apply_override(cfg: DictConfig, word: str) -> None:

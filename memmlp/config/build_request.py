@@ -44,6 +44,7 @@ def build_motion(cfg: DictConfig) -> MotionSource:
         settings = {str(key): value for key, value in data.synth.items() if key != "name"}
         generator = find_component("generator", data.synth.name)
         folder = "-".join([generator.name, *(f"{key}{value}" for key, value in settings.items())])
+        folder = folder.replace("/", "_")  # a setting must not choose another folder
         if generator.name == "puppet":
             folder = f"{data.synth.minutes:g}min-seed{data.synth.seed}"
         version = f"-v{generator.version}" if generator.version > 1 else ""

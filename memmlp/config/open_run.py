@@ -58,12 +58,14 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
         InputError: if the run does not exist, an override would change its training or have no effect, or its
             data has changed since the training.
     """
-    return open_existing_run(find_run(outputs, name), device_name, overrides)
+    run = find_run(outputs, name)
+    experiment = build_run_experiment(run, device_name, overrides, outputs)
+    return OpenedRun(run, experiment, load_run_data(run, experiment))
 
 
-def open_existing_run(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
-    """Open a finished run like `open_run`, from its `Run` object."""
-    experiment = build_run_experiment(run, device_name, overrides)
+def open_existing_run(run: Run) -> OpenedRun:
+    """Open a finished run like `open_run`, from its `Run` object, on the CPU."""
+    experiment = build_run_experiment(run)
     return OpenedRun(run, experiment, load_run_data(run, experiment))
 
 
@@ -77,11 +79,15 @@ def load_run_data(run: Run, experiment: Experiment) -> PreparedMotion:
     return data
 
 
-def build_run_experiment(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Experiment:
-    """Return the experiment of a finished run, without its data. Raises InputError like `open_run`."""
-    experiment = replace(
-        build_experiment(load_config(run, overrides), remote=True), device=choose_device(device_name)
-    )
+def build_run_experiment(
+    run: Run, device_name: str = "cpu", overrides: Sequence[str] = (), outputs: Path | None = None
+) -> Experiment:
+    """Return the experiment of a finished run, without its data. Raises InputError like `open_run`.
+
+    By default, caches are in the outputs folder that contains the run.
+    """
+    cfg = load_config(run, overrides, outputs)
+    experiment = replace(build_experiment(cfg, remote=True), device=choose_device(device_name))
     if select_training_config(run.config) != select_training_config(experiment.config):
         words = ", ".join(overrides)
         raise InputError(f"{words}: would change the training; set only keys of evaluation and export")

@@ -7,24 +7,29 @@ matches the digests in its files.
 
 from __future__ import annotations
 
+import mmap
 import os
 import re
 import shutil
+import struct
 import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_file, file_digest, read_json, sync_folder
+from memmlp.common.files import atomic_file, file_digest, naming_file, sync_folder
+from memmlp.runs import records
 from memmlp.runs.identity import ID
 from memmlp.runs.lookup import get_notes_path
 from memmlp.runs.run import Run
 
 MAX_FILES = 1000
 MAX_SIZE = 4 * 10**9  # default limit for the total size of all files, bytes
-PART = r"[\w.-]*[\w-]"  # a folder or file name; not ".."
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+PART = r"\w[\w.-]{0,99}"  # a folder or file name; not ".."
 ALLOWED = re.compile(
     "|".join(
         re.escape(pattern).replace(r"\*", PART)
@@ -85,15 +90,25 @@ def import_run(
     if sha256 is not None and file_digest(path) != sha256.lower():
         raise InputError(f"{path}: must have the SHA-256 {sha256}, but has {file_digest(path)}")
     try:
+        _check_member_count(path)
         with zipfile.ZipFile(path) as archive:
             run_id, names = _check_names(archive, path, max_size)
             run, new = _move_to_runs(archive, path, run_id, outputs)
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, struct.error, RuntimeError, EOFError, ValueError) as error:
         raise InputError(f"{path}: must be an archive of a run ({error})") from None
     missing = (name for name in names if "/" in name and not (run.folder / name).exists())
     if not new and (more := sorted({"/".join(name.split("/")[:2]) for name in missing})):
         report(f"{path}: also contains {', '.join(more)}; not added, since run {run.id} already exists")
     return run, new
+
+
+def _check_member_count(path: Path) -> None:
+    """Raise InputError for an archive with too many members, before `zipfile` lists them in memory."""
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        if next(islice(re.finditer(rb"PK\x01\x02", content), MAX_FILES, None), None):
+            raise InputError(f"{path}: must be an archive of a run with at most {MAX_FILES} files")
 
 
 def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> tuple[str, list[str]]:
@@ -105,6 +120,8 @@ def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> tuple[s
         folder, _, file = name.partition("/")
         if folder != run_id or not ALLOWED.fullmatch(file):
             raise InputError(f"{path}: {name!r} is not a file of run {run_id}")
+    if any(one.compress_type not in METHODS for one in archive.infolist()):
+        raise InputError(f"{path}: must be stored or deflated, as memmlp runs export does")
     if (total := sum(one.file_size for one in archive.infolist())) > max_size:
         raise InputError(
             f"{path}: must be at most {max_size / 1e9:.1f} GB (--max-gb), but is {total / 1e9:.1f} GB"
@@ -118,7 +135,8 @@ def _move_to_runs(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Pa
     place.folder.parent.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(dir=place.folder.parent, prefix=".import-"))
     try:
-        archive.extractall(staging)
+        with naming_file(place.folder):
+            archive.extractall(staging)
         run = Run(staging / run_id)
         _check_unpacked_run(run, path)
         if not place.folder.exists():
@@ -135,11 +153,12 @@ def _move_to_runs(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Pa
 
 def _check_unpacked_run(run: Run, path: Path) -> None:
     """Raise InputError if the unpacked files are not a finished, unchanged run."""
+    if damage := run.damage:
+        raise InputError(f"{path}: {damage[0].removeprefix(f'{run.folder}/')}")
     if not run.done or run.manifest.get("id") != run.id or not run.config:
         raise InputError(f"{path}: must contain a finished run {run.id}")
     run.metrics()
-    artifacts = read_json(run.marker).get("artifacts")
-    if not isinstance(artifacts, dict) or not artifacts:
+    if not records.read(run.marker, records.Marker).get("artifacts"):
         raise InputError(f"{path}: {run.marker.name} must contain the digests of the run's artifacts")
     if changed := run.verify():
         raise InputError(

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.files import file_digest, now, read_json, write_json
+from memmlp.common.files import file_digest, now, to_number, write_json
+from memmlp.runs import records
 from memmlp.runs.identity import belongs_to_folder, find_deployment_versions, hash_deployment_settings
 
 ONNX_FILES = {
@@ -80,7 +81,7 @@ class DeploymentFolder:
     @property
     def record(self) -> dict[str, Any]:
         """The measurements (sizes, times, accuracy of lower precisions); empty before `finish`."""
-        return read_json(self.latency)
+        return records.read(self.latency, records.Deployment)
 
     @property
     def creation_time(self) -> str:
@@ -107,7 +108,7 @@ def is_accurate_enough(cost: Mapping[str, Any]) -> bool:
         cost: the relative growth of its errors, "growth" and "jitter_growth". Missing and NaN count as
             inaccurate.
     """
-    growth, jitter = (cost.get(name, math.inf) for name in ("growth", "jitter_growth"))
+    growth, jitter = (to_number(cost.get(name, math.inf)) for name in ("growth", "jitter_growth"))
     return growth <= MAX_GROWTH and jitter <= MAX_JITTER_GROWTH
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import make_json_safe, now, read_json, to_number, write_json
+from memmlp.common.files import make_json_safe, now, to_number, write_json
+from memmlp.runs import records
 from memmlp.runs.environment import describe_environment
 from memmlp.runs.identity import (
     belongs_to_folder,
@@ -28,27 +27,20 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
     """Write an evaluation file: the report with time, environment and a digest."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = make_json_safe({**report, "made": now(), "made_by": describe_environment()})
-    content.pop("digest", None)
-    write_json(path, content | {"digest": _compute_content_digest(content)})
+    write_json(path, content | {"digest": records.compute_digest(content)})
 
 
 def read_report(path: Path) -> dict[str, Any]:
     """Read an evaluation file. Raises InputError if it is damaged."""
-    report = read_json(path)
-    check_report(path, report)
-    return report
-
-
-def check_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Raise InputError if the content of an evaluation file is not a valid report."""
-    if not {"mode", "mean", "clips"} <= report.keys():
-        raise InputError(f"{path}: cannot be read; remove it and repeat the run's command to evaluate again")
+    if report := records.load(path, records.Evaluation):
+        return report
+    raise InputError(f"{path}: missing; repeat the run's command to evaluate again")
 
 
 def is_intact(path: Path) -> bool:
     """Return whether an evaluation file is unchanged and has its original name and folder."""
-    content = read_json(path)
-    same = content.pop("digest", None) == _compute_content_digest(content)
+    content = records.read(path, records.Evaluation)
+    same = content.get("digest") == records.compute_digest(content)
     named = content.get("name", path.stem) == path.stem
     return same and named and belongs_to_folder(content.get("run"), path.parent.parent)
 
@@ -64,9 +56,8 @@ def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
 
     Custom metrics from packages that are not in use are ignored.
     """
-    comparable = {
-        name: number for name, number in report.get("component_versions", {}).items() if find_version(name)
-    }
+    recorded = report.get("component_versions") or {}
+    comparable = {name: number for name, number in recorded.items() if find_version(name)}
     return ", ".join(list_outdated(comparable)) or None
 
 
@@ -132,10 +123,6 @@ def add_solver_names(results: Mapping[str, Any], solvers: Mapping[str, str | Non
     }
 
 
-def _compute_content_digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
 class ConfiguredEvaluations:
     """A run's evaluations that match the run's config.
 
@@ -150,11 +137,11 @@ class ConfiguredEvaluations:
             folder: the run's evaluations folder.
             config: the run's config.
         """
-        every = {path: read_json(path) for path in sorted(folder.glob("*.json"))}
+        every = {path: records.read(path, records.Evaluation) for path in sorted(folder.glob("*.json"))}
         matching = [
             (path, one)
             for path, one in every.items()
-            if has_configured_inference(one.get("settings", {}), config)
+            if not one or has_configured_inference(one.get("settings") or {}, config)
         ]
         self._matching = dict(sorted(matching, key=lambda one: make_preference_key(one[0], one[1], config)))
         self.paths = list(self._matching)
@@ -192,6 +179,4 @@ class ConfiguredEvaluations:
         return {str(mode): changed for mode, changed in last.items() if changed}
 
     def _read_reports(self) -> list[dict[str, Any]]:
-        for path, report in self._matching.items():
-            check_report(path, report)
-        return list(self._matching.values())
+        return list(map(read_report, self._matching))

@@ -89,7 +89,7 @@ def _find_orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     used = _list_prerequisites(runs) | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
     unused = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
-    empty = [run for run in runs if not run.manifest]
+    empty = [run for run in runs if not run.manifest and not run.damage]
     reasons = {run_id: f"no run uses this {describe_kind(kinds[run_id])}" for run_id in unused}
     return reasons | {run.id: "an empty folder" for run in empty}
 
@@ -103,7 +103,9 @@ def _list_plans(outputs: Path) -> Iterator[Path]:
 
 def _read_entries(path: Path, key: str) -> Iterator[Mapping[str, Any]]:
     entries = read_json(path).get(key)
-    yield from (one for one in entries or () if isinstance(one, dict) and "id" in one)
+    for one in entries if isinstance(entries, list) else ():
+        if isinstance(one, dict) and isinstance(one.get("id"), str):
+            yield one
 
 
 def _has_notes(run: Run) -> bool:

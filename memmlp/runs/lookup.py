@@ -5,6 +5,7 @@ Tags and notes are stored in the file `notes.json` of a run's folder. They do no
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import read_json, write_json
+from memmlp.common.files import write_json
+from memmlp.runs import records
 from memmlp.runs.identity import ID, NETWORK
 from memmlp.runs.run import Run
 
@@ -49,6 +51,13 @@ def find_run(outputs: Path | str, name: str) -> Run:
     raise InputError(
         f"run '{name}': must be a run's folder, or the first digits of one of {len(runs)} run ids in {where}"
     )
+
+
+def find_outputs(run: Run) -> Path:
+    """Return the outputs folder of a run; for a run that was copied elsewhere, the default folder."""
+    if run.folder.parent.name == "runs":
+        return run.folder.parent.parent
+    return Path(os.environ.get("MEMMLP_OUTPUTS", "outputs"))
 
 
 def is_trained(run: Run) -> bool:
@@ -89,7 +98,8 @@ def count_training_frames(run: Run) -> float:
     seen = float(run.total_steps * (optim.get("batch") or 0) * length)
     if not refiner:
         return seen
-    before = count_training_frames(Run(run.folder.parent / str(run.manifest.get("prerequisite"))))
+    network = Run(run.folder.parent / str(run.manifest.get("prerequisite")))
+    before = 0.0 if network.config.get("refiner") else count_training_frames(network)
     return seen + before if seen and before else 0.0
 
 
@@ -128,10 +138,8 @@ def get_notes_path(run: Run) -> Path:
 
 def read_notes(run: Run) -> Notes:
     """Return a run's tags and note; both are empty if the file is missing or damaged."""
-    content = read_json(get_notes_path(run))
-    tags, note = content.get("tags"), content.get("note")
-    words = [tag for tag in tags if isinstance(tag, str)] if isinstance(tags, list) else []
-    return Notes(tuple(sorted(set(words))), note if isinstance(note, str) else "")
+    content = records.read(get_notes_path(run), records.Notes)
+    return Notes(tuple(sorted(set(content.get("tags", ())))), content.get("note", ""))
 
 
 def add_tags(run: Run, tags: Iterable[str]) -> Notes:

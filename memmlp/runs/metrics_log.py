@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import functools
 import json
 import os
 import time
@@ -13,6 +14,10 @@ from typing import NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, make_json_safe
 from memmlp.common.lease import check_owner
+from memmlp.runs.records import parse_log_entry
+
+MAX_BYTES = 64 * 2**20
+TAIL_BYTES = 2**14  # searched for recent records
 
 
 class LogRecord(NamedTuple):
@@ -32,10 +37,19 @@ class LogRecord(NamedTuple):
 
 
 def parse_record(line: bytes) -> LogRecord:
-    """Parse a line of the log. Raises ValueError, KeyError or TypeError if it is not a record."""
-    entry = json.loads(line)
+    """Parse a line of the log. Raises ValueError if it is not a record."""
+    entry = parse_log_entry(line)
     values = {key: float(value) for key, value in entry["values"].items()}
     return LogRecord(entry["step"], entry["phase"], values, entry["time"])
+
+
+@functools.lru_cache(20_000)
+def _find_damage(path: Path, *stamp: int) -> str | None:
+    try:
+        MetricsLog(path).read_tail()
+    except InputError as error:
+        return str(error)
+    return None
 
 
 class MetricsLog:
@@ -70,7 +84,7 @@ class MetricsLog:
         Later writes of an earlier owner go to the old file and are lost.
         """
         if self.path.exists():
-            content = self.path.read_bytes()
+            content = self.read_bytes()
             atomic_write(self.path, content[: content.rfind(b"\n") + 1])
         self._whole = True
 
@@ -82,15 +96,43 @@ class MetricsLog:
         Raises:
             InputError: if a line is damaged; the message names file and line.
         """
+        return list({(one.phase, one.step): one for one in self._parse(self.read_bytes())}.values())
+
+    def read_tail(self) -> list[LogRecord]:
+        """Return the records in the last TAIL_BYTES. Raises InputError like `read`."""
+        content = self.read_bytes(-TAIL_BYTES)
+        return self._parse(content.partition(b"\n")[2] if len(content) == TAIL_BYTES else content)
+
+    def find_damage(self) -> str | None:
+        """Return the error of `read_tail` as text, or None. An unchanged log is not read again."""
+        try:
+            found = self.path.stat()
+        except OSError:
+            return None
+        return _find_damage(self.path, found.st_mtime_ns, found.st_size)
+
+    def read_bytes(self, start: int = 0) -> bytes:
+        """Return the log's content from a byte on, or the last bytes if `start` is negative.
+
+        Raises:
+            InputError: if the log is not a regular file, or too large.
+        """
         if not self.path.exists():
-            return []
-        entries: dict[tuple[str, int], LogRecord] = {}
-        for number, line in enumerate(self.path.read_bytes().split(b"\n")[:-1], 1):
+            return b""
+        if not self.path.is_file() or (size := self.path.stat().st_size) > MAX_BYTES:
+            raise InputError(f"{self.path}: must be a file of at most {MAX_BYTES} bytes")
+        with open(self.path, "rb") as file:
+            file.seek(max(size + start, 0) if start < 0 else start)
+            return file.read(MAX_BYTES)
+
+    def _parse(self, content: bytes) -> list[LogRecord]:
+        found = []
+        for number, line in enumerate(content.split(b"\n")[:-1], 1):
             try:
-                metrics = parse_record(line)
-            except (ValueError, KeyError, TypeError):
+                found.append(parse_record(line))
+            except ValueError as error:
+                where = f"line {number}" if len(content) != TAIL_BYTES else "a line near its end"
                 raise InputError(
-                    f"{self.path}: line {number} is damaged; remove it, or repeat the run with force=true"
+                    f"{self.path}: {where} is damaged ({error}); remove it, or repeat the run with force=true"
                 ) from None
-            entries[metrics.phase, metrics.step] = metrics
-        return list(entries.values())
+        return found

@@ -42,6 +42,7 @@ def build_record(run: Run) -> dict[str, Any]:
     - Times and size of the file that the config requests. If the exported file differs from it, the key names
       the difference: `latency-int8.median_ms`.
     """
+    run.check_records()
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     named = add_solver_names(run.results, run.configured_evaluations.combined_solvers)
     results = {key: to_number(value) for key, value in flatten(replace_with_deployed_times(named)).items()}
@@ -217,8 +218,8 @@ class _Tokens:
             raise self.make_error(f"expected a value after {key}{sign}, but found '{value}'")
         if sign in ORDER and _parse_number(value) is None and key != "started":
             raise self.make_error(f"expected a number after {key}{sign}, but found '{value}'")
-        if key == "status" and value not in (*STATUSES, "damaged"):
-            statuses = ", ".join([*STATUSES, "damaged"])
+        if key == "status" and value not in STATUSES:
+            statuses = ", ".join(STATUSES)
             raise InputError(f"--where '{self.text}': status={value} must be one of {statuses}")
         self.keys.append(key)
         if key == "started" and sign in ORDER:  # ISO 8601 times, which may be typed in part, like 2025-03

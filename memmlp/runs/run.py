@@ -7,8 +7,6 @@ folder that is named by its id. It is complete or absent.
 from __future__ import annotations
 
 import contextlib
-import copy
-import functools
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -18,9 +16,9 @@ from typing import Any
 import yaml
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
+from memmlp.common.files import atomic_write, file_digest, now, sync_folder, write_json
 from memmlp.common.lease import Lease, Lock, check_owner
-from memmlp.runs import deployment_folder
+from memmlp.runs import deployment_folder, records
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import (
     create_code_patch,
@@ -43,15 +41,8 @@ from memmlp.runs.metrics_log import LogRecord, MetricsLog
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
 """The status of a run while a process works on a stage, by stage."""
 
-STATUSES = (*STAGE_WORDS.values(), "done", "trained", "lost", "failed", "stopped", "new")
+STATUSES = (*STAGE_WORDS.values(), "done", "trained", "lost", "failed", "damaged", "stopped", "new")
 """The statuses of runs (`Run.state`)."""
-
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the C loader is six times as fast
-
-
-@functools.lru_cache(maxsize=16)
-def _parse(text: str) -> Any:
-    return yaml.load(text, LOADER)
 
 
 def name_latency(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
@@ -242,15 +233,17 @@ class Run:
     def state(self, complete: bool) -> str:
         """Return the state of the run, given whether the caller considers it complete.
 
-        The states are: done, running (a process works on it), lost (its process died), failed, trained (a
-        requested evaluation or deployment is missing), stopped, new.
+        The states are: done, running (a process works on it), lost (its process died), failed, damaged (a
+        record cannot be read), trained (a requested evaluation or deployment is missing), stopped, new.
         """
-        if complete:
+        if complete and not self.damage:
             return "done"
         if (held := self._lock.is_held) is not None:
             return "running" if held else "lost"
         if self.failure:
             return "failed"
+        if self.damage:
+            return "damaged"
         if self.done:
             return "trained"
         return "stopped" if self.manifest_path.exists() else "new"
@@ -258,7 +251,36 @@ class Run:
     @property
     def failure(self) -> str | None:
         """The reason why the run failed, in one line; None if it has not failed."""
-        return read_json(self.folder / "FAILED").get("reason")
+        return records.read(self.folder / "FAILED", records.Failure).get("reason")
+
+    @property
+    def damage(self) -> list[str]:
+        """A line for each record that cannot be read, with the file and the reason."""
+        files = {
+            self.config_path: records.Config,
+            self.manifest_path: records.Manifest,
+            self.marker: records.Marker,
+            self.folder / "FAILED": records.Failure,
+            self.folder / "notes.json": records.Notes,
+            self.results_path: records.Tree,
+            **dict.fromkeys(sorted(self.evaluations.glob("*.json")), records.Evaluation),
+            **dict.fromkeys(sorted(self.deployments.glob("*/latency.json")), records.Deployment),
+        }
+        found = [line for path, kind in files.items() if (line := records.find_damage(path, kind))]
+        missing = [path for path in (self.config_path, self.manifest_path) if not path.exists()]
+        found += [f"{path}: missing" for path in missing if self.marker.exists()]
+        return found + list(filter(None, [self._log.find_damage()]))
+
+    @property
+    def fault(self) -> str | None:
+        """The reason why the run failed, or else its damaged record; None without either."""
+        return self.failure or next(iter(self.damage), None)
+
+    def check_records(self) -> None:
+        """Raise InputError if a record of the run cannot be read."""
+        if damage := self.damage:
+            more = f" (and {len(damage) - 1} more)" if len(damage) > 1 else ""
+            raise InputError(f"{damage[0]}{more}; remove the file, or the run folder to repeat the run")
 
     def fail(self, reason: str, details: str = "") -> None:
         """Record the reason why the run failed."""
@@ -330,15 +352,13 @@ class Run:
         Raises:
             InputError: if the existing manifest can't be read, since its content would be lost.
         """
-        manifest = self.manifest
-        if not manifest and self.manifest_path.exists():
-            raise InputError(f"{self.manifest_path}: damaged; remove the run folder to repeat the run")
+        manifest = records.load(self.manifest_path, records.Manifest)
         write_json(self.manifest_path, manifest | dict(fields))
 
     @property
     def manifest(self) -> dict[str, Any]:
         """The facts about the run; empty before it began."""
-        return read_json(self.manifest_path)
+        return records.read(self.manifest_path, records.Manifest)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -347,13 +367,7 @@ class Run:
         Raises:
             InputError: if the file is damaged.
         """
-        try:
-            config = copy.deepcopy(_parse(self.config_path.read_text())) if self.config_path.exists() else {}
-        except (yaml.YAMLError, UnicodeDecodeError):
-            config = None
-        if not isinstance(config, dict):
-            raise InputError(f"{self.config_path}: cannot be read; remove the run folder to repeat the run")
-        return config
+        return records.load(self.config_path, records.Config)
 
     @property
     def results(self) -> dict[str, Any]:
@@ -368,7 +382,7 @@ class Run:
         Raises:
             InputError: if an evaluation file is damaged.
         """
-        results = read_json(self.results_path) | self.configured_evaluations.results
+        results = records.read(self.results_path, records.Tree) | self.configured_evaluations.results
         config = self.config
         deployed = self.find_shown_deployment(config)
         return results | ({name_latency(deployed, config): deployed.record} if deployed.record else {})
@@ -409,8 +423,16 @@ class Run:
             return int(steps)
         try:
             return int(find_training_settings(str(self.manifest.get("kind")), self.config)["steps"] or 0)
-        except (KeyError, TypeError):
+        except (KeyError, TypeError, ValueError):
             return 0
+
+    @property
+    def recent_metrics(self) -> list[LogRecord]:
+        """The last records of the metrics log; empty if it is damaged."""
+        try:
+            return self._log.read_tail()
+        except InputError:
+            return []
 
     def metrics(self) -> list[LogRecord]:
         """Return all records of the metrics log (`MetricsLog.read`)."""
@@ -426,13 +448,13 @@ class Run:
     @property
     def done(self) -> bool:
         """Whether the training is finished, and the marker file belongs to this run."""
-        marker = read_json(self.marker)
+        marker = records.read(self.marker, records.Marker)
         return "artifacts" in marker and belongs_to_folder(marker.get("id"), self.folder)
 
     @property
     def weights_digest(self) -> str | None:
         """The SHA-256 of the weights at the end of training; None before."""
-        return read_json(self.marker).get("artifacts", {}).get(self.model.name)
+        return records.read(self.marker, records.Marker).get("artifacts", {}).get(self.model.name)
 
     def weights(self) -> Path:
         """Return the file of the trained weights, after checking its digest.
@@ -447,10 +469,10 @@ class Run:
 
     def verify(self) -> list[str]:
         """Return the artifacts of a finished run that are missing or have changed."""
-        artifacts = dict(read_json(self.marker).get("artifacts", {}))
+        artifacts = dict(records.read(self.marker, records.Marker).get("artifacts", {}))
         for latency in sorted(self.deployments.glob("*/latency.json")):
             where = latency.parent.relative_to(self.folder)
-            exported = read_json(latency).get("artifacts", {})
+            exported = records.read(latency, records.Deployment).get("artifacts", {})
             artifacts |= {str(where / name): digest for name, digest in exported.items()}
         changed = [name for name, digest in artifacts.items() if not self._same(name, digest)]
         reports = sorted(self.evaluations.glob("*.json"))

@@ -19,6 +19,9 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.runs.run import Run
 
+FAULTY = ("failed", "damaged", "blocked")
+"""The states of tasks that no worker takes."""
+
 
 @dataclass(frozen=True)
 class RunTask:
@@ -108,10 +111,10 @@ class Plan:
     def is_complete(self, task: RunTask | Entry) -> bool:
         """Return whether the run is trained and has all required stages."""
         run = self.get_run(task)
-        return run.done and all(map(run.has, task.stages))
+        return run.done and all(map(run.has, task.stages)) and not run.damage
 
     def read_states(self, before: Mapping[str, str] | None = None) -> dict[str, str]:
-        """Return the state of each task's run by the task's key; "blocked" if a prerequisite run failed.
+        """Return the state of each task's run by the task's key; "blocked" if a prerequisite run is FAULTY.
 
         Args:
             before: earlier states. Tasks that were done then are not read again.
@@ -128,7 +131,7 @@ class Plan:
         """Return the states, with "blocked" for each task after a failed prerequisite."""
         found = dict(states)
         for task in self.tasks:  # prerequisites come first
-            if found[task.key] != "done" and found.get(task.prerequisite or "") in ("failed", "blocked"):
+            if found[task.key] != "done" and found.get(task.prerequisite or "") in FAULTY:
                 found[task.key] = "blocked"
         return found
 
@@ -139,7 +142,7 @@ class Plan:
             states: the tasks' states; by default, they are read from the run folders.
         """
         states = self.read_states() if states is None else states
-        ended = ("done", "failed", "blocked")
+        ended = ("done", *FAULTY)
         return [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
 
     def save(self, path: Path) -> None:
@@ -216,4 +219,4 @@ def estimate_time(plan: Plan) -> Forecast | None:
 def read_run_seconds(run: Run) -> float | None:
     """Return the total seconds of all stages of a finished run; None for an unfinished run."""
     found = run.manifest.get("seconds") if run.done else None
-    return sum(found.values()) if isinstance(found, dict) else found
+    return sum(found.values()) if found else None

@@ -20,13 +20,14 @@ from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
 COLOURS = {
-    "done": "green", "running": "cyan", "failed": "red", "blocked": "red", "lost": "yellow",
+    "done": "green", "running": "cyan", "failed": "red", "damaged": "red", "blocked": "red", "lost": "yellow",
     "trained": "yellow",
 }  # fmt: skip
 STATE_NAMES = {
     "new": "waiting", "trained": "trained, unfinished",
     "stopped": "waiting, started", "lost": "lost, to be taken over",
 }  # fmt: skip
+FAULTS = ("failed", "damaged")  # states with a reason
 VARIANT_WIDTH = 20  # the minimum width of the variants' column, unless all labels are shorter
 QUIET = 300.0  # seconds without a line in a log before the progress of running runs is printed
 
@@ -111,7 +112,7 @@ class Board(Screen):
 
 def _describe_change(plan: Plan, task: RunTask, state: str) -> str:
     run = plan.get_run(task)
-    reason = run.failure if state == "failed" else None
+    reason = run.fault if state in FAULTS else None
     return f"{describe_task(plan, task)}: {STATE_NAMES.get(state, state)}{f', {reason}' if reason else ''}"
 
 
@@ -158,9 +159,9 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
             Text("cm: done; MPJPE of the rotation branch in stream mode (tables may show other branches)")
         )
     below += [
-        Text(f"{describe_task(plan, task)}: {plan.get_run(task).failure}", style="red")
+        Text(f"{describe_task(plan, task)}: {plan.get_run(task).fault}", style="red")
         for task in plan.tasks
-        if states[task.key] == "failed"
+        if states[task.key] in FAULTS
     ]
     return Group(table, *below)
 

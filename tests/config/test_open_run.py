@@ -40,3 +40,39 @@ def test_keys_of_later_stages_may_have_other_values(trained: Run):
 def test_a_key_without_effect_or_with_several_values_is_refused(trained: Run, word: str):
     with pytest.raises(InputError, match=f"^.*{word}"):
         build_run_experiment(trained, "cpu", [word])
+
+
+def test_a_recorded_config_decides_nowhere_where_a_command_writes(trained: Run, tmp_path: Path):
+    victim = tmp_path / "victim"
+    recorded = {"paths": {"outputs": str(victim)}, "save_predictions": str(victim), "force": True}
+    recorded["loggers"] = {"mlflow": {"uri": f"sqlite:///{victim}/m.db"}}
+    here = tmp_path / "here"
+    for root, expected in (
+        (victim / "data" / "synth", here / "data" / "synth"),
+        (victim / "other", here / "other"),
+        (tmp_path / "elsewhere", here / "data" / "synth"),
+        (victim / ".." / "elsewhere", here / "data" / "synth"),
+    ):
+        config = trained.config | recorded
+        config["data"] = config["data"] | {"root": str(root)}
+        trained.config_path.write_text(yaml.safe_dump(config))
+        experiment = build_run_experiment(trained, outputs=here)
+        assert experiment.outputs == here
+        assert experiment.motion.caches == here / "cache"
+        assert experiment.motion.clips.root.parent == expected
+        assert experiment.loggers.loggers == ()
+        assert (experiment.config["save_predictions"], experiment.config["force"]) == (None, False)
+    assert build_run_experiment(trained).outputs == trained.folder.parent.parent
+    assert not victim.exists()
+
+
+@pytest.mark.parametrize("slot", ["hand", "model", "optim", "loss"])
+def test_only_registered_components_are_built(trained: Run, slot: str):
+    attack = {"name": "memmlp.common.npm.os.abort", "_target_": "memmlp.common.npm.os.abort"}
+    trained.config_path.write_text(yaml.safe_dump(trained.config | {slot: attack}))
+    with pytest.raises(InputError, match=r"abort|_target_"):
+        build_run_experiment(trained)
+    attack["name"] = str(compose_config(["profile=tiny"])[slot].name)
+    trained.config_path.write_text(yaml.safe_dump(trained.config | {slot: attack}))
+    with pytest.raises(InputError, match=r"_target_"):
+        build_run_experiment(trained)

@@ -134,7 +134,7 @@ def error_of(action: Callable[[], object]) -> Exception | None:
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("memmlp.runs.environment.read_code_files", lambda packages: {"a.py": b"0"})
     monkeypatch.setattr("memmlp.runs.run.create_code_patch", lambda: "")
-    for module in ("run", "evaluation_file", "deployment_folder"):
+    for module in ("run", "evaluation_file", "environment"):
         monkeypatch.setattr(f"memmlp.runs.{module}.describe_environment", lambda: {"host": "h"})
 
 

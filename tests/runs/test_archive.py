@@ -4,6 +4,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from mutated_runs import BOMB
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest
@@ -38,12 +39,12 @@ def archive(run: Run, tmp_path: Path) -> Path:
     return tmp_path / "run.zip"
 
 
-def changed(archive: Path, files: dict[str, bytes]) -> Path:
+def changed(archive: Path, files: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
     """Write the archive again with other files."""
     with zipfile.ZipFile(archive) as old:
         content = {name: old.read(name) for name in old.namelist()}
     content |= {f"{NAME}/{name}": data for name, data in files.items()}
-    with zipfile.ZipFile(archive, "w") as new:
+    with zipfile.ZipFile(archive, "w", method) as new:
         for name, data in content.items():
             new.writestr(name, data)
     return archive
@@ -132,6 +133,26 @@ def test_an_archive_cut_anywhere_is_refused(archive: Path, tmp_path: Path):
     for length in range(0, len(whole), 97):
         archive.write_bytes(whole[:length])
         refused(archive, tmp_path / "there", "must be an archive")
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"manifest.json": b'{"id": "0123456789abcdef", "attempts": 5}'}, "attempts must be a list"),
+        ({"config.yaml": b"a: &a {b: *a}"}, "config.yaml: cannot be read .has an alias"),
+        ({"config.yaml": BOMB.encode()}, "config.yaml: cannot be read .has an alias"),
+        ({"metrics.jsonl": b'{"step": 1, "phase": [], "time": 1, "values": {}}\n'}, "phase must be text"),
+        ({"DONE": b'{"id": "0123456789abcdef", "artifacts": {"../../x": "0"}}'}, "artifacts must be valid"),
+        ({f"evaluations/e{n}.json": b"{}" for n in range(1000)}, "at most 1000 files"),
+    ],
+)
+def test_a_hostile_archive_is_refused(archive: Path, tmp_path: Path, files: dict[str, bytes], words: str):
+    refused(changed(archive, files), tmp_path / "there", words)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_only_stored_and_deflated_files_are_unpacked(archive: Path, tmp_path: Path, method: int):
+    refused(changed(archive, {}, method), tmp_path / "there", "must be stored or deflated")
 
 
 def test_another_run_of_that_id_stays(run: Run, archive: Path, tmp_path: Path):

@@ -14,7 +14,7 @@ from memmlp.runs.run import Run
 def test_runs_are_found_by_the_beginning_of_their_id(tmp_path: Path):
     runs = [begun(tmp_path, CONFIG | {"seed": seed}) for seed in range(10)]
     for seed, run in enumerate(runs):
-        run.write_manifest({"started": f"202{seed}"})
+        run.write_manifest({"started": f"202{seed}-01-01"})
     (tmp_path / "runs" / "notes").mkdir()
     assert [run.id for run in lookup.list_runs(tmp_path)] == [run.id for run in runs[::-1]]
     for outputs, name in (

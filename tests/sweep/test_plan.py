@@ -45,7 +45,7 @@ def finish(plan: Plan, name: str, seconds: object) -> None:
     task = next(task for task in plan.tasks if task.id == name)
     run = plan.get_run(task)
     run.begin(task.kind, {}, data="d", prerequisite=task.prerequisite)
-    run.write_manifest({"seconds": seconds})
+    run.write_manifest({"seconds": {"train": seconds} if isinstance(seconds, float | int) else seconds})
     run.results_path.write_text("{}")
     run.finish(["results.json"])
 

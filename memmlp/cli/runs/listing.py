@@ -78,8 +78,8 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
         click.echo(f"no runs in {outputs.absolute() / 'runs'}: {hint}")
         return
     chosen = runs if every or query else [run for run in runs if not _is_finished_part(run)]
-    newest = chosen if every or query or sort else chosen[:MAX_RUNS]
-    records = {run.id: read_record(run) for run in newest}
+    records = _read_records(chosen, len(chosen) if every or query or sort else MAX_RUNS)
+    newest = [run for run in chosen if run.id in records]
     fits = query.match_records(list(records.values())) if query else [True] * len(records)
     listed = [run for run, fit in zip(newest, fits, strict=True) if fit]
     if sort:
@@ -87,7 +87,8 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     keys = _choose_keys(columns, records, listed)
     rows = [{**records[run.id], "age": format_age(run)} for run in listed]
     hidden = _print_table(rows, keys, keys_requested=columns is not None)
-    for line in (*_describe_outdated_results(listed), *_describe_hardly_trained(listed)):
+    sound = [run for run in listed if records[run.id]["status"] != "damaged"]
+    for line in (*_describe_outdated_results(sound), *_describe_hardly_trained(sound)):
         click.echo(line)
     if hidden:
         more = f" and {len(hidden) - MAX_NAMED_KEYS} more keys" if len(hidden) > MAX_NAMED_KEYS else ""
@@ -100,6 +101,16 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
         click.echo(f"{len(chosen) - len(newest)} older runs: memmlp runs list --all")
     elif query:
         click.echo(f"{len(listed)} of {len(chosen)} runs")
+
+
+def _read_records(runs: Sequence[Run], most: int) -> dict[str, Record]:
+    """Return the records of runs, until `most` of them are undamaged."""
+    records: dict[str, Record] = {}
+    for run in runs:
+        if sum(one["status"] != "damaged" for one in records.values()) == most:
+            break
+        records[run.id] = read_record(run)
+    return records
 
 
 def _describe_outdated_results(listed: Sequence[Run]) -> list[str]:

@@ -59,6 +59,8 @@ def make_state_finder(plan: Plan) -> DescribeRun:
             return None
         run = plan.get_run(entry)
         state = run.activity or run.state(plan.is_complete(entry))
+        if state == "damaged":
+            return f"damaged: {run.damage[0]}"
         if state == "trained":
             return "trained, an evaluation or export is missing"
         return state if state not in ("new", "done") else None

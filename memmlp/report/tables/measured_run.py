@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import read_json
 from memmlp.common.processes import MIN_CORE_FRACTION
 from memmlp.evaluation.metric_facts import MIN_FRAMES
 from memmlp.motion.preparing.groups import Grouping
+from memmlp.runs import records
 from memmlp.runs.deployment_folder import (
     describe_timing_machine,
     find_deployed_precision,
     select_deployed_measurements,
 )
 from memmlp.runs.environment import collect_prerequisite_versions, get_recorded_prerequisites
-from memmlp.runs.evaluation_file import is_intact, keep_one_solver
+from memmlp.runs.evaluation_file import is_intact, keep_one_solver, read_report
 from memmlp.runs.lookup import count_training_frames
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import TIMES
@@ -244,14 +244,15 @@ def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> Meas
         InputError: if a file is damaged.
     """
     run = Run(folder)
-    manifest = _read_intact_json(run.manifest_path)
+    run.check_records()
+    manifest = records.load(run.manifest_path, records.Manifest)
     means: dict[str, dict[str, Any]] = {}
     clips: dict[str, dict[str, Any]] = {}
     groups: dict[str, str] = {}
     sources: dict[str, str] = {}
     wanted = [path for name in stages or () if (path := run.evaluation(name)).is_file()]
     paths = wanted or run.configured_evaluations.paths
-    reports = keep_one_solver(list(map(_read_evaluation, paths)))
+    reports = keep_one_solver(list(map(_read_intact_report, paths)))
     for report in reports:
         _merge_report(means.setdefault(report["mode"], {}), report["mean"])
         for clip in report["clips"]:
@@ -297,21 +298,14 @@ def _merge_report(merged: dict[str, Any], report: Mapping[str, Any]) -> None:
         merged[name] = {**merged.get(name, {}), **value} if isinstance(value, Mapping) else value
 
 
-def _read_intact_json(path: Path) -> dict[str, Any]:
-    content = read_json(path)
-    if not content:
-        raise InputError(f"{path}: cannot be read; repeat the run with force=true, or remove its folder")
-    return content
-
-
-def _read_evaluation(path: Path) -> dict[str, Any]:
-    content = _read_intact_json(path)
+def _read_intact_report(path: Path) -> dict[str, Any]:
+    report = read_report(path)
     if not is_intact(path):
         raise InputError(
-            f"{path}: changed since it was written (its digest is missing or wrong); "
+            f"{path}: changed since it was written, or of another run or evaluation; "
             "remove it and repeat the run's command to evaluate again"
         )
-    return content
+    return report
 
 
 def _read_costs(latency: Mapping[str, Any]) -> dict[str, float]:

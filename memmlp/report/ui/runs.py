@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import make_json_safe, read_json
+from memmlp.common.files import make_json_safe
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.table_text import find_direction, find_unit
-from memmlp.report.ui.run_index import COSTS, RunIndex, parse_line, read_config
+from memmlp.report.ui.run_index import COSTS, RunIndex, read_config
 from memmlp.runs.deployment_folder import select_deployed_measurements
-from memmlp.runs.evaluation_file import add_solver_names
+from memmlp.runs.evaluation_file import add_solver_names, read_report
 from memmlp.runs.identity import NETWORK, NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import count_training_frames, is_trained, warn_if_hardly_trained
 from memmlp.runs.run import Run
@@ -110,7 +110,8 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         places: the sweeps and searches by run id.
     """
     facts, run = index.runs[run_id], Run.from_id(index.outputs, run_id)
-    config, clips = _read_flat_config(run), read_clips(run)
+    config, is_sound = _read_flat_config(run), facts["kind"] == NETWORK and not facts["damage"]
+    clips = read_clips(run)
     return {
         **facts,
         "places": places.get(run_id, []),
@@ -127,7 +128,7 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         "latency": _read_latency(run),
         "changed": run.verify() if run.done else [],
         "outdated": list_outdated_modes(run),
-        "remark": _warn_of_short_training(run) if facts["kind"] == NETWORK and not facts["damage"] else "",
+        "remark": warn_if_hardly_trained(count_training_frames(run)) if is_sound else "",
         "files": _list_files(run.folder),
     }
 
@@ -159,9 +160,9 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
         frames = {
             report["name"]: report.get("frames")
             for path in evaluations.paths
-            for report in read_json(path).get("clips", [])
+            for report in read_report(path)["clips"]
         }
-    except (InputError, KeyError, TypeError):
+    except InputError:
         return []
     return [
         {
@@ -191,13 +192,6 @@ def list_outdated_modes(run: Run) -> list[str]:
         return []
 
 
-def _warn_of_short_training(run: Run) -> str:
-    try:
-        return warn_if_hardly_trained(count_training_frames(run))
-    except (ValueError, TypeError, AttributeError):
-        return ""
-
-
 def _list_files(folder: Path) -> list[dict[str, Any]]:
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
     return [
@@ -214,18 +208,17 @@ def read_curves(run: Run) -> dict[str, Any]:
     """Return a run's curves by name, such as "train loss": [steps, values]; None for NaN or infinity."""
     try:
         stat = run.metrics_path.stat()
-    except OSError:
+        return _read_log(run.folder, stat.st_mtime_ns, stat.st_size)
+    except (OSError, InputError):
         return {}
-    return _parse_log(run.metrics_path, stat.st_mtime_ns, stat.st_size)
 
 
 @lru_cache(1024)
-def _parse_log(path: Path, *stamp: int) -> dict[str, Any]:
+def _read_log(folder: Path, *stamp: int) -> dict[str, Any]:
     series: dict[str, dict[int, float]] = defaultdict(dict)
-    for line in path.read_bytes().splitlines():
-        if entry := parse_line(line):
-            for name, value in entry["values"].items():
-                series[f"{entry['phase']} {name}"][entry["step"]] = value
+    for entry in Run(folder).metrics():
+        for name, value in entry.values.items():
+            series[f"{entry.phase} {name}"][entry.step] = value
     return {name: thin_out(points) for name, points in series.items()}
 
 

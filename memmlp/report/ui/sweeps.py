@@ -31,7 +31,7 @@ from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, find_training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, load_sweep_copy
-from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.plan import FAULTY, Entry, Plan, RunTask
 from memmlp.sweep.progress_table import describe_task
 
 DAMAGED_ROUNDS = "seed rounds cannot be read: error probabilities of these verdicts may exceed 5 %"
@@ -157,14 +157,15 @@ class Sweeps:
         if not facts["done"] or facts["status"] not in ("done", "trained", "lost"):
             return facts["status"]
         run = plan.get_run(task)
-        return "done" if all(map(run.has, task.stages)) else run.activity or run.state(False)
+        return run.activity or run.state(all(map(run.has, task.stages)))
 
     def _describe_cell(self, entry: Entry, state: str, value: float | None) -> dict[str, Any]:
         facts = self.index.runs.get(entry.id, {})
         recent = facts.get("recent") or [[0, 0, None]]
         return {
             "variant": entry.label, "seed": entry.seed, "id": entry.id, "state": state, "value": value,
-            "step": recent[-1][0], "steps": facts.get("steps"), "failure": facts.get("failure", ""),
+            "step": recent[-1][0], "steps": facts.get("steps"),
+            "failure": facts.get("failure") or "; ".join(facts.get("damage", ())),
         }  # fmt: skip
 
     def _count_steps(self, task: RunTask, state: str) -> tuple[int, int]:
@@ -186,7 +187,7 @@ class Sweeps:
         ]
         if not running or not paces:
             return None
-        remaining = sum(left for key, (_, left) in steps.items() if states[key] not in ("failed", "blocked"))
+        remaining = sum(left for key, (_, left) in steps.items() if states[key] not in FAULTY)
         return remaining * statistics.median(paces) / len(running) if remaining else None
 
     def _get_results(self, known_sweep: KnownSweep) -> dict[str, Any]:
@@ -209,6 +210,7 @@ class Sweeps:
 
         def find_run(variant: Variant, seed: int) -> MeasuredRun | None:
             entry = entries.get((variant.label, seed))
+            flags.extend(plan.get_run(entry).damage if entry else ())
             if entry is None or not plan.is_complete(entry):
                 return None
             try:

@@ -18,12 +18,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from memmlp.common.files import digest, file_digest, make_json_safe, read_json
+from memmlp.common.files import digest, file_digest, make_json_safe
+from memmlp.runs import records
 from memmlp.runs.deployment_folder import replace_with_deployed_times
 from memmlp.runs.evaluation_file import add_solver_names
 from memmlp.runs.identity import flatten
 from memmlp.runs.lookup import get_run_name, read_notes
-from memmlp.runs.metrics_log import parse_record
+from memmlp.runs.metrics_log import MetricsLog, parse_record
 from memmlp.runs.run import Run
 
 ORIGIN = ("kind", "data", "prerequisite", "started", "version", "user", "host", "device", "gpu", "threads")
@@ -98,19 +99,18 @@ def read_run_facts(run: Run, running: bool = False) -> RunFacts:
         run: the run.
         running: whether the run is in progress; otherwise its final state is read.
     """
+    run.check_records()
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    failure, finished = read_json(run.folder / "FAILED"), manifest.get("finished")
+    failure, finished = records.read(run.folder / "FAILED", records.Failure), manifest.get("finished")
     status = "running" if running else "failed" if failure else "done" if run.complete else "killed"
-    records = run.metrics()
+    log = run.metrics()
     started = _parse_time(manifest.get("started"))
-    ended = _parse_time(failure.get("when") or finished) or max(
-        (one.time for one in records), default=started
-    )
+    ended = _parse_time(failure.get("when") or finished) or max((one.time for one in log), default=started)
     evaluations, deployed = run.configured_evaluations, run.find_shown_deployment(config)
     results = flatten(
         add_solver_names(replace_with_deployed_times(run.results), evaluations.combined_solvers)
     )
-    step = max((record.step for record in records), default=0)
+    step = max((record.step for record in log), default=0)
     git = manifest.get("git") or {}
     origin = {name: manifest.get(name) for name in ORIGIN}
     origin |= {"commit": git.get("commit"), "changed since the commit": git.get("dirty")}
@@ -151,25 +151,21 @@ class LogReader:
     """
 
     def __init__(self, run: Run):
-        self.path, self.offset, self.repeated = run.metrics_path, 0, False
+        self.log, self.offset, self.repeated = MetricsLog(run.metrics_path), 0, False
         self.last: dict[str, int] = {}  # the last step of each phase
 
     def read(self) -> list[CurvePoint]:
         """Return the values of new lines; for a repeated step, only its last values."""
-        if not self.path.exists():
-            return []
-        with open(self.path, "rb") as file:
-            file.seek(self.offset)
-            content = file.read()
+        content = self.log.read_bytes(self.offset)
         content = content[: content.rfind(b"\n") + 1]  # the last line may be incomplete
         self.offset += len(content)
-        records = {(record.phase, record.step): record for record in map(parse_record, content.splitlines())}
-        self.repeated |= any(step <= self.last.get(phase, -1) for phase, step in records)
-        for phase, step in records:
+        found = {(record.phase, record.step): record for record in map(parse_record, content.splitlines())}
+        self.repeated |= any(step <= self.last.get(phase, -1) for phase, step in found)
+        for phase, step in found:
             self.last[phase] = max(step, self.last.get(phase, 0))
         return [
             CurvePoint(f"{record.phase}/{key}", value, record.step, record.time)
-            for record in records.values()
+            for record in found.values()
             for key, value in record.values.items()
         ]
 

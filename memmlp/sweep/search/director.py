@@ -119,6 +119,9 @@ class Director:
         """
         last = [tasks[-1] for tasks in one.seeds]
         runs = [self.plan.get_run(task) for task in last]
+        if damage := [line for task in one.tasks for line in self.plan.get_run(task).damage]:
+            self.study.fail(one.trial, damage[0])
+            return True
         for task, run in zip(last, runs, strict=True):
             used = select_inference_config(run.config) if run.done else None
             expected = select_inference_config(task.config)

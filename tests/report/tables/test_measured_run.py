@@ -87,7 +87,7 @@ def test_results_without_their_digest_are_refused(tmp_path: Path, keep: bool):
     report = json.loads(path.read_text())
     report["mean"]["rotation"]["MPJPE"] = 1.0
     path.write_text(json.dumps({key: value for key, value in report.items() if keep or key != "digest"}))
-    with pytest.raises(InputError, match=r"stream-0.json: changed .* digest"):
+    with pytest.raises(InputError, match=r"stream-0.json: .*changed .* digest"):
         load_measured_run(run.folder)
 
 
@@ -98,7 +98,7 @@ def test_clips_without_a_value_are_counted_at_the_number(tmp_path: Path, sweep: 
     path = run.evaluation("stream-0")
     report = json.loads(path.read_text())
     for clip in report["clips"][:2]:
-        clip["rotation"]["Jitter"] = "NaN"
+        clip["rotation"]["Jitter"] = "nan"
     write_evaluation(path, report)
     table = table_of(sweep, find)
     found = [cell(table, "full_model", metric) for metric in ("Jitter", "MPJPE")]

@@ -7,18 +7,18 @@ import pytest
 from report.ui.conftest import run_of, started_run
 
 from memmlp.report.ui import run_index
-from memmlp.report.ui.run_index import RunIndex, read_facts, read_recent_entries
+from memmlp.report.ui.run_index import RunIndex, read_facts
 
 
 def test_facts_of_a_finished_run(outputs: Path):
     run = run_of(outputs, "gru", 1)
-    (run.folder / "notes.json").write_text(json.dumps({"tags": ["good", 7], "note": "<b>look</b>"}))
+    (run.folder / "notes.json").write_text(json.dumps({"tags": ["good"], "note": "<b>look</b>"}))
     found = read_facts(run.folder)
     assert (found["id"], found["done"], found["steps"], found["damage"]) == (run.id, True, 2000, [])
     error = run.results["stream"]["rotation"]["MPJPE"]
     assert found["metrics"]["stream.rotation.MPJPE"] == pytest.approx(error)
     assert found["metrics"]["latency.median_ms"] == pytest.approx(0.64)
-    assert (found["tags"], found["note"]) == (["good", "7"], "<b>look</b>")
+    assert (found["tags"], found["note"]) == (["good"], "<b>look</b>")
     assert found["recent"][-1][0] == 2000
     path = run.deployment("fp32-0").latency
     record = json.loads(path.read_text())
@@ -33,24 +33,28 @@ def test_facts_of_a_finished_run(outputs: Path):
 @pytest.mark.parametrize(("name", "content", "damaged"), [
     ("manifest.json", b"{", "manifest.json"), ("config.yaml", b"a: [", "config.yaml"),
     ("config.yaml", b"\xff\xfe", "config.yaml"), ("config.yaml", b"- a list", "config.yaml"),
-    ("evaluations/stream-0.json", b'{"mean": 3}', "evaluations"), ("notes.json", b"[1]", None),
-    ("metrics.jsonl", b"\x00\x00 no line\n{}\n", None), ("deployments/fp32-0/latency.json", b"[", None),
-    ("FAILED", b"[]", None), (".holder", b'{"pid": "no number", "host": 3}', None),
+    ("evaluations/stream-0.json", b'{"mean": 3}', "evaluations/stream-0.json"),
+    ("notes.json", b"[1]", "notes.json"), ("metrics.jsonl", b"\x00\x00 no line\n{}\n", "metrics.jsonl"),
+    ("deployments/fp32-0/latency.json", b"[", "deployments/fp32-0/latency.json"),
+    ("FAILED", b"[]", "FAILED"), (".holder", b'{"pid": "no number", "host": 3}', None),
 ])  # fmt: skip
 def test_damage_is_listed_and_raises_nothing(outputs: Path, name: str, content: bytes, damaged: str | None):
     run = run_of(outputs)
     (run.folder / name).write_bytes(content)
     index = RunIndex(outputs)
     index.refresh()
-    assert (len(index.runs), index.runs[run.id]["damage"]) == (6, [damaged] if damaged else [])
+    assert len(index.runs) == 6
+    damage = index.runs[run.id]["damage"]
+    assert [line.partition(":")[0] for line in damage] == ([damaged] if damaged else [])
+    assert index.runs[run.id]["status"] == ("damaged" if damaged else "done")
 
 
-def test_a_folder_without_anything_is_a_run_that_is_damaged(outputs: Path):
+def test_a_folder_without_anything_is_a_new_run(outputs: Path):
     (outputs / "runs" / ("0" * 16)).mkdir()
     (outputs / "runs" / "no run").mkdir()
     index = RunIndex(outputs)
     index.refresh()
-    assert index.runs["0" * 16]["damage"] == ["manifest.json", "config.yaml"]
+    assert (index.runs["0" * 16]["status"], index.runs["0" * 16]["damage"]) == ("new", [])
     assert "no run" not in index.runs
 
 
@@ -95,7 +99,7 @@ def test_a_run_is_not_done_while_it_is_evaluated_or_once_its_deployment_failed(o
 
 def test_last_entries_of_a_log_that_is_being_written(tmp_path: Path):
     path = tmp_path / "metrics.jsonl"
+    assert read_facts(tmp_path)["recent"] == []
     lines = [{"step": step, "phase": "train", "time": step, "values": {"loss": 1}} for step in range(9)]
     path.write_text("\n".join(map(json.dumps, lines)) + '\n{"step": 9, "pha')
-    assert [entry[0] for entry in read_recent_entries(path)] == [4, 5, 6, 7, 8]
-    assert read_recent_entries(tmp_path / "none") == []
+    assert [entry[0] for entry in read_facts(tmp_path)["recent"]] == [4, 5, 6, 7, 8]

@@ -9,6 +9,7 @@ from fake_logger import FakeLogger, Server, a_run, an_outdated_evaluation, losse
 from processes import until
 
 from memmlp.common.files import write_json
+from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import VERSIONS
 from memmlp.runs.loggers import logger as module
 from memmlp.runs.loggers.logger import Loggers, LogReader, Session, read_run_facts, sync_runs
@@ -135,7 +136,7 @@ def test_status_is_that_of_the_folder(tmp_path: Path):
     run.finish([])
     assert read_run_facts(run).status == "killed"
     run.evaluations.mkdir()
-    write_json(run.evaluation("stream-0"), {"mode": "stream", "mean": {}, "clips": []})
+    write_report(run.evaluation("stream-0"), {"mode": "stream", "mean": {}, "clips": []})
     assert read_run_facts(run).status == "killed"
     run.deployment("fp32-0").folder.mkdir(parents=True)
     run.deployment("fp32-0").finish({})
@@ -145,7 +146,9 @@ def test_status_is_that_of_the_folder(tmp_path: Path):
 
 def test_name_origin_data_labels_and_note(tmp_path: Path):
     run = a_run(tmp_path, data={"name": "mocap"}, memory={"layers": [2]})
-    run.write_manifest({"name": "memory=gru · seed 1", "user": "somebody", "git": {"commit": "abc"}})
+    run.write_manifest(
+        {"name": "memory=gru · seed 1", "user": "somebody", "git": {"commit": "abc", "dirty": False}}
+    )
     add_tags(run, ["good"])
     set_note(run, "a note")
     facts = read_run_facts(run)

@@ -58,7 +58,9 @@ def history(store: Path, run: Run, key: str) -> list[tuple[int, float]]:
 
 def test_a_run_from_its_start_to_its_end(store: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     logger, run = MLflow(None, store), a_run(tmp_path)
-    run.write_manifest({"name": "memory=gru · seed 1", "user": "somebody", "git": {"commit": "c" * 40}})
+    run.write_manifest(
+        {"name": "memory=gru · seed 1", "user": "somebody", "git": {"commit": "c" * 40, "dirty": False}}
+    )
     session = Session(logger, run)
     session.update()
     assert shown(store)[run.id].info.status == "RUNNING"

@@ -44,7 +44,7 @@ function head(run) {
 
 function warnings(run) {
   const lines = [
-    ['Failed', run.failure], ['Damaged', run.damage.length && `${run.damage.join(', ')} cannot be read.`], ['Its network', run.remark && `${run.remark}.`],
+    ['Failed', run.failure], ['Damaged', run.damage.length && `${run.damage.join('; ')}.`], ['Its network', run.remark && `${run.remark}.`],
     ['Changed since it was made', run.changed.join(', ')],
     ['Measured by an earlier component version', run.outdated.length && `${run.outdated.join(', ')}. Measure it again with memmlp eval ${run.id}.`],
   ];

@@ -12,7 +12,7 @@ const METRICS = ['stream.rotation.MPJPE', 'stream.rotation.MPJRE', 'stream.rotat
 const NARROW = matchMedia('(max-width: 640px)'); // errors come before keys on a narrow screen
 export const ACTIVE = ['training', 'evaluating', 'exporting'];
 export const FINISHED = ['done', 'trained'];
-const STATES = [...ACTIVE, ...FINISHED, 'failed', 'lost', 'stopped', 'new'];
+const STATES = [...ACTIVE, ...FINISHED, 'failed', 'damaged', 'lost', 'stopped', 'new'];
 export const STATE_WORDS = { new: 'waiting' };
 const STATE_TITLES = { trained: 'Trained; an evaluation or export that was asked for is missing.' };
 
@@ -181,7 +181,7 @@ export const tags = run => run.tags.map(tag => h('span', { class: 'tag' }, tag))
 
 // The state of a run in words, and the progress of one that trains.
 export function status(run) {
-  if (run.damage.length) return h('span', { class: 'state damaged', title: `cannot be read: ${run.damage.join(', ')}` }, 'damaged');
+  if (run.damage.length) return h('span', { class: 'state damaged', title: run.damage.join('; ') }, 'damaged');
   const [first, last] = [run.recent[0], run.recent.at(-1)];
   if (run.status !== 'training' || !last || !run.steps) return state(run.status, run.failure || undefined);
   const pace = last[0] > first[0] ? (last[1] - first[1]) / (last[0] - first[0]) : null;

@@ -7,7 +7,7 @@ import { forest, frontier } from './charts.js';
 import { ACTIVE, look, state, STATE_WORDS } from './runs.js';
 import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
 
-const ORDER = ['done', ...ACTIVE, 'trained', 'lost', 'stopped', 'new', 'failed', 'blocked'];
+const ORDER = ['done', ...ACTIVE, 'trained', 'lost', 'stopped', 'new', 'failed', 'damaged', 'blocked'];
 
 export async function page() {
   const element = h('div', { class: 'page' });

@@ -1,0 +1,343 @@
+"""The types of a run's records, and the only way to read them.
+
+A run's folder may come from anybody. A record is read only if it is a regular file of a bounded size, has
+only plain values, and its known fields have their types. Unknown fields are kept.
+"""
+
+import functools
+import hashlib
+import json
+import os
+import re
+import stat
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypedDict
+
+from memmlp.common.components import SLOTS
+from memmlp.common.errors import InputError
+from memmlp.common.schema import check_type, parse_json, parse_yaml
+
+MAX_JSON, MAX_YAML = 16 * 2**20, 2**18  # bytes
+CACHED_FILES, CACHED_REASONS = 32, 20_000  # the records of three runs; the reasons of two thousand
+
+
+def is_time(text: str) -> bool:
+    """Return whether a text is a time in ISO 8601."""
+    try:
+        return bool(datetime.fromisoformat(text))
+    except ValueError:
+        return False
+
+
+Time = Annotated[str, is_time]
+Name = Annotated[str, re.compile(r"\w[\w.-]{0,200}").fullmatch]  # a file's name, without a folder
+Number = Literal["nan", "inf", "-inf"] | float
+Errors = dict[str, Number | None]
+Word = str | int | None
+
+
+class Attempt(TypedDict, total=False):
+    """The begin of a process' work on a run."""
+
+    started: Time
+    step: int
+    stage: str
+
+
+class Commit(TypedDict):
+    """The commit of the code."""
+
+    commit: str
+    dirty: bool
+
+
+class EarlierCommit(Commit, total=False):
+    """The commit of the code, and of the code before the run was resumed."""
+
+    before: str
+
+
+class Plugin(TypedDict):
+    """Version and code digest of a custom package."""
+
+    version: str | None
+    digest: str
+
+
+class Origin(TypedDict, total=False):
+    """Code and machine."""
+
+    version: str
+    git: EarlierCommit | None
+    packages: dict[str, str | None] | None
+    cpu: Word
+    component_versions: dict[str, int] | None
+    sources: dict[str, str] | None
+    plugins: dict[str, Plugin] | None
+    device: Word
+    gpu: Word
+    gpu_index: Word
+    threads: Word
+    processes: Word
+    precision: Word
+
+
+class PrerequisiteRun(Origin, total=False):
+    """The origin of a prerequisite run."""
+
+    id: Name
+    kind: str
+    weights: str | None
+
+
+class Manifest(Origin, total=False):
+    """manifest.json: facts about a run."""
+
+    id: str
+    kind: str
+    name: str
+    user: str | None
+    data: str
+    body: str
+    prerequisite: Name | None
+    prerequisite_runs: list[PrerequisiteRun] | None
+    prerequisite_tflop: float | None
+    started: Time
+    finished: Time | None
+    seconds: dict[str, float] | None
+    attempts: list[Attempt]
+    forgiven: int
+    stages: list[Name]
+    steps: int | None
+    best_step: int | None
+    tflop: float | None
+    source_bytes: dict[str, str]
+    partial: str | None
+    divided: str | None
+    resampled: str | None
+    unusual: str | None
+
+
+class Marker(TypedDict, total=False):
+    """DONE: the digests of the files of a finished training."""
+
+    id: str
+    finished: Time
+    artifacts: dict[Name, str]
+
+
+class Failure(TypedDict, total=False):
+    """FAILED: the reason of a failure."""
+
+    reason: str
+    when: Time
+    details: str
+
+
+class Notes(TypedDict, total=False):
+    """notes.json: tags and note of a run."""
+
+    tags: list[str]
+    note: str
+
+
+class Component(TypedDict, total=False):
+    """A config group of a component, with the keys that are read without the component."""
+
+    name: str
+    frames: int | None
+    steps: int | None
+    batch: int | None
+    tflop: float | None
+
+
+class Data(TypedDict, total=False):
+    """The config group `data`."""
+
+    name: str
+    split: dict[str, Any] | None
+    sources: dict[str, dict[str, Any]] | None
+    synth: dict[str, Any] | None
+
+
+class Evaluating(TypedDict, total=False):
+    """The config group `evaluation`."""
+
+    ik: str | bool | None
+    modes: list[str]
+    metrics: list[str] | None
+
+
+Group = dict[str, Any] | None
+CONFIG: Any = {
+    "plugins": list[str] | None,
+    "data": Data | None,
+    "vqvae": Component | None,
+    "evaluation": Evaluating,
+    "loggers": dict[str, Group] | None,
+    **dict.fromkeys(("paths", "profile"), Group),
+    **dict.fromkeys(("normalizer", "export"), dict[str, Any]),
+    **dict.fromkeys(SLOTS, Component | None),
+    "optim": Component,
+}
+Config = TypedDict("Config", CONFIG, total=False)  # type: ignore[misc]
+"""config.yaml: the groups of a resolved config."""
+
+
+class Settings(TypedDict, total=False):
+    """The settings of an evaluation or a deployment."""
+
+    mode: str
+    ik: str | None
+    ik_iterations: int | None
+    metrics: dict[str, Any] | None
+    graph: str
+    precision: str
+    opset: int
+
+
+class Clip(TypedDict, total=False):
+    """The errors on a test clip; all other fields are branches."""
+
+    group: str | None
+    source: str | None
+    frames: int | None
+
+
+class NamedClip(Clip):
+    """The errors on a test clip with its name."""
+
+    name: str
+
+
+def _has_branches(clip: Mapping[str, Any]) -> bool:
+    check_type(dict(clip), NamedClip)
+    errors = {key: value for key, value in clip.items() if key not in ("name", *Clip.__annotations__)}
+    check_type(errors, dict[str, Errors])
+    return True
+
+
+class Results(TypedDict):
+    """The results of an evaluation: means, and a row for each clip."""
+
+    mode: str
+    mean: dict[str, Errors]
+    clips: list[Annotated[dict[str, Any], _has_branches]]
+
+
+class Evaluation(Results, Origin, total=False):
+    """evaluations/ID.json: an evaluation."""
+
+    run: str
+    name: str
+    settings: Settings | None
+    made: str
+    made_by: Origin
+    digest: str
+    offline: bool
+
+
+COSTS = (
+    "median_ms", "p95_ms", "alone_median_ms", "pose_median_ms", "ratio_to_yardstick", "core_share",
+    "alone_core_share", "pose_core_share", "flops", "macs", "parameters", "onnx_bytes",
+    "growth", "jitter_growth", "onnx_parity",
+)  # fmt: skip
+Costs = TypedDict("Costs", dict.fromkeys(COSTS, Number), total=False)  # type: ignore[misc]
+"""The costs of an exported file."""
+
+
+class Deployment(Costs, total=False):
+    """deployments/ID/latency.json: measurements of a deployment."""
+
+    run: str
+    settings: Settings
+    made: str
+    made_by: Origin
+    artifacts: dict[Name, str]
+    graph: str
+    int8: Costs
+    int8_blocks: Costs
+    fp16: Costs
+
+
+class LogEntry(TypedDict):
+    """A line of metrics.jsonl."""
+
+    step: int
+    phase: str
+    values: dict[str, Number]
+    time: float
+
+
+Tree = dict[str, Any]  # results.json
+
+
+def read(path: Path, kind: Any) -> dict[str, Any]:
+    """Return the record in a file; empty if the file is missing or damaged (see `find_damage`)."""
+    reason, stamp = _look_at(path, kind)
+    return dict(_parse(path, kind, stamp)[0]) if stamp and not reason else {}
+
+
+def load(path: Path, kind: Any) -> dict[str, Any]:
+    """Return the record in a file; empty if the file is missing. Raises InputError if it is damaged."""
+    if damage := find_damage(path, kind):
+        raise InputError(f"{damage}; remove the file, or the run folder to repeat the run")
+    return read(path, kind)
+
+
+def find_damage(path: Path, kind: Any) -> str | None:
+    """Return the file and the reason why it is not a record of this type; None if it is, or is missing."""
+    reason, _ = _look_at(path, kind)
+    return f"{path}: cannot be read ({reason})" if reason else None
+
+
+Stamp = tuple[int, ...]  # changes with a file
+
+
+def _look_at(path: Path, kind: Any) -> tuple[str | None, Stamp | None]:
+    """Return the reason why a file is not a record, or None, and its stamp; None if it is missing."""
+    try:
+        found = os.stat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return None, None
+    except OSError as error:
+        return error.strerror, None
+    limit = MAX_YAML if path.suffix == ".yaml" else MAX_JSON
+    if not stat.S_ISREG(found.st_mode) or found.st_size > limit:
+        return f"must be a file of at most {limit} bytes", None
+    stamp = (found.st_mtime_ns, found.st_size, found.st_ino)
+    return _find_reason(path, kind, stamp), stamp
+
+
+@functools.lru_cache(CACHED_REASONS)
+def _find_reason(path: Path, kind: Any, stamp: Stamp) -> str | None:
+    return _parse(path, kind, stamp)[1]
+
+
+@functools.lru_cache(CACHED_FILES)
+def _parse(path: Path, kind: Any, stamp: Stamp) -> tuple[dict[str, Any], str | None]:
+    """Return the record, and None or the reason why there is none."""
+    try:
+        content = path.read_bytes()
+        value = parse_yaml(content.decode()) if path.suffix == ".yaml" else parse_json(content)
+        check_type(value, kind)
+        if kind is Evaluation and value.get("digest") != compute_digest(value):
+            raise ValueError("changed since it was written: its digest is missing or wrong")
+    except (OSError, ValueError) as error:
+        return {}, getattr(error, "strerror", None) or " ".join(str(error).split())
+    return value, None
+
+
+def compute_digest(content: Mapping[str, Any]) -> str:
+    """Return the digest of an evaluation's content, 16 hex digits."""
+    content = {key: value for key, value in content.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def parse_log_entry(line: bytes) -> LogEntry:
+    """Parse a line of a metrics log. Raises ValueError if it is not valid."""
+    entry = parse_json(line)
+    check_type(entry, LogEntry)
+    return entry  # type: ignore[no-any-return]

@@ -1,0 +1,128 @@
+"""Mutated run folders and archives: the good run is shown, and each bad one is one line."""
+
+from __future__ import annotations
+
+import io
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from begun_runs import complete
+from conftest import Memmlp
+from fake_logger import FakeLogger
+from mutated_runs import STAGES, make_mutants, make_run, mutate_archive
+from rich.console import Console
+
+from memmlp.common.errors import InputError
+from memmlp.report.tables.build_table import (
+    find_finished_runs,
+    make_run_finder,
+    make_state_finder,
+    make_table,
+)
+from memmlp.report.tables.measured_run import load_measured_run
+from memmlp.report.tables.table_text import to_json
+from memmlp.report.ui.server import Answers
+from memmlp.runs.archive import export_run, import_run
+from memmlp.runs.loggers.logger import sync_runs
+from memmlp.runs.lookup import list_runs
+from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.progress_table import render
+from memmlp.sweep.sweep_file import parse_sweep
+
+MAX_SECONDS, MAX_BYTES = 5.0, 300e6
+COUNTS = [40, pytest.param(500, marks=pytest.mark.slow)]
+
+
+@contextmanager
+def timed(command: str) -> Iterator[None]:
+    started = time.process_time()
+    yield
+    assert time.process_time() - started < MAX_SECONDS, command
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_damaged_runs_hide_no_other(memmlp: Memmlp, tmp_path: Path, count: int):
+    good = make_run(tmp_path / "outputs", "the good run")
+    runs = [good, *make_mutants(tmp_path / "outputs", count)]
+    bad = {run.id for run in runs if run.damage}
+    assert good.id not in bad
+    assert len(bad) > count / 3
+    with timed("runs list"):
+        ran = memmlp("runs", "list", "--all")
+    lines = ran.err.splitlines()
+    assert (ran.code, good.id in ran.out, len(lines)) == (0, True, len(bad))
+    assert all(sum(run_id in line for line in lines) == 1 for run_id in bad)
+
+    with timed("ui"):
+        answers = Answers(tmp_path / "outputs", lambda *words: {})
+        rows = {row["id"]: row for row in answers.answer("runs", {})["rows"]}
+    assert {run_id for run_id, row in rows.items() if row["damage"]} == bad
+    for run in runs:
+        page = answers.answer(f"run/{run.id}", {})
+        assert bool(page["clips"]) or run is not good
+        answers.answer("curves", {"runs": run.id})
+
+    entries = [Entry("bad" if run is not good else "good", n, run.id, STAGES) for n, run in enumerate(runs)]
+    tasks = [RunTask(run.id, "memmlp", {"optim": {"steps": 600}}, None, STAGES) for run in runs]
+    plan = Plan("mine", tmp_path / "outputs", tuple(entries), tuple(tasks))
+    console = Console(width=1000, file=io.StringIO(), record=True)
+    with timed("sweep --status"):
+        console.print(render(plan, plan.read_states()))
+    lines = console.export_text().splitlines()
+    assert all(sum(f"/{run_id}/" in line for line in lines) == 1 for run_id in bad)
+
+    variants = {"good": {"overrides": []}, "bad": {"overrides": ["a=b"]}}
+    sweep = parse_sweep(
+        "mine", {"title": "T", "seeds": list(range(count + 1)), "variants": variants, "metrics": ["MPJPE"]}
+    )
+    with timed("table"):
+        found = find_finished_runs(sweep, make_run_finder(plan, load_measured_run))
+        table = make_table(sweep, found, describe_run=make_state_finder(plan))
+    assert list(found["good"]) == [0]
+    assert not bad & {run.id for run in found["bad"].values()}
+    text = to_json(table)
+    assert all(text.count(f"/{run_id}/") == 1 for run_id in bad)
+
+    logger, warnings = FakeLogger(), []
+    with timed("loggers sync"):
+        sync_runs(logger, list_runs(tmp_path / "outputs"), warnings.append)
+    assert good.id in logger.server.fingerprints
+    assert all(sum(run_id in line for line in warnings) == 1 for run_id in bad)
+
+
+@pytest.mark.slow
+def test_a_list_of_damaged_runs_takes_little_memory(tmp_path: Path):
+    make_mutants(tmp_path, 500, seed=1)
+    code = (
+        f"from memmlp.cli.main import main; main(['runs', 'list', '--all', '--outputs', {str(tmp_path)!r}])"
+    )
+    measure = "; import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)"
+    ran = subprocess.run([sys.executable, "-c", code + measure], capture_output=True, text=True, check=True)
+    assert float(ran.stdout.splitlines()[-1]) < MAX_BYTES
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_a_mutated_archive_is_one_line_and_leaves_nothing(tmp_path: Path, count: int):
+    run, dice = complete(tmp_path / "here"), random.Random(0)
+    export_run(run, tmp_path / "run.zip")
+    refused = 0
+    with timed("runs import"):
+        for number in range(count):
+            there = tmp_path / "there" / str(number)
+            mutate_archive(tmp_path / "run.zip", tmp_path / "mutant.zip", dice)
+            imported, error = None, ""
+            try:
+                imported, _ = import_run(tmp_path / "mutant.zip", there)
+            except InputError as raised:
+                error = str(raised)
+            assert imported or error.startswith(f"{tmp_path / 'mutant.zip'}: "), number
+            assert imported or not list(there.rglob("*/*")), number
+            assert not imported or (imported.damage, imported.verify()) == ([], []), number
+            refused += imported is None
+    assert refused > count / 2
