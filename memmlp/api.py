@@ -362,7 +362,7 @@ class Prediction:
 
 
 def _find_outputs(given: StrPath | None) -> Path:
-    return Path(os.environ.get("MEMMLP_OUTPUTS", "outputs") if given is None else given)
+    return Path(os.environ.get("MEMMLP_OUTPUTS", "outputs") if given is None else given).expanduser()
 
 
 def _use(plugins: Sequence[str]) -> None:

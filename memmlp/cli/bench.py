@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from memmlp.cli.options import config_dir_option, plugins_option
+from memmlp.cli.options import PATH, config_dir_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.deploy.latency import RoundTimes
@@ -44,7 +44,7 @@ def bench() -> None:
     show_default=True,
     help="Options of `model` to time, separated by commas; NAME@FRAMES sets model.frames.",
 )
-@click.option("--json", "file", type=click.Path(path_type=Path), help="JSON file to write the rows into.")
+@click.option("--json", "file", type=PATH, help="JSON file to write the rows into.")
 @click.argument("overrides", nargs=-1)
 @config_dir_option
 @plugins_option
@@ -153,8 +153,9 @@ def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, flo
 
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
     """Print the rows as a table with one line per row, 80 characters wide."""
-    from rich.console import Console
     from rich.table import Table
+
+    from memmlp.common.text_formats import make_console
 
     print(f"milliseconds on one thread; each of {rounds} rounds times all networks")
     print("x: the time divided by AvatarPoser's time, for the network or for the whole pose")
@@ -175,7 +176,7 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
             *("" if value is None else shorten_number(value) for value in pose),
             f"{100 * core:.0f}",
         )
-    Console().print(table)
+    make_console().print(table)
 
 
 def shorten_number(number: float) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import shutil
 import sys
 import time
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
+from memmlp.common.text_formats import join_command
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -88,17 +89,17 @@ def describe_next_steps(
         environment: the folder of a virtual environment to activate first; None if none is needed.
         runs: ids of the demo's runs. With two ids, the first command draws the motion of both networks.
     """
-    command = shlex.join(["memmlp", "train", *overrides, "memory=none"])
-    kept = [shlex.quote(word) for word in overrides if word.startswith(("profile=", "threads=", "device="))]
+    command = join_command(["memmlp", "train", *overrides, "memory=none"])
+    kept = [word for word in overrides if word.startswith(("profile=", "threads=", "device="))]
     lines = [
         f"{command}          the same network without its memory; then memmlp runs list",
         "memmlp data import BVH_FOLDER --out outputs/data/mine",
-        " ".join(["memmlp train", *kept, "data=mocap data.root=outputs/data/mine"]),
+        join_command(["memmlp", "train", *kept, "data=mocap", "data.root=outputs/data/mine"]),
     ]
     if len(runs) > 1:
-        lines.insert(0, shlex.join(["memmlp", "render", *runs, *LABELS, "--to", "3", "--out", "both.gif"]))
+        lines.insert(0, join_command(["memmlp", "render", *runs, *LABELS, "--to", "3", "--out", "both.gif"]))
     if environment:
-        lines.insert(0, f"source {shlex.quote(str(environment / 'bin' / 'activate'))}")
+        lines.insert(0, join_command(["source", str(environment / "bin" / "activate")]))
     return "next: " + "\n      ".join(lines)
 
 

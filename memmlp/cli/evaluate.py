@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import check_runs_exist, device_option, outputs_option, plugins_option
+from memmlp.cli.options import PATH, check_runs_exist, device_option, outputs_option, plugins_option
 from memmlp.common.errors import InputError
 
 
@@ -15,13 +15,13 @@ from memmlp.common.errors import InputError
 @click.argument("overrides", nargs=-1)
 @click.option(
     "--save-predictions",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Folder for the true and predicted motion, with one npz file per test clip.",
 )
 @click.option(
     "--json",
     "json_path",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="JSON file for the metrics: means, and one row per clip.",
 )
 @click.option("--again", is_flag=True, help="Repeat existing measurements.")
@@ -48,10 +48,9 @@ def evaluate(
         raise InputError(f"--json {json_path}: must be a file in an existing folder")
     if save_predictions is not None and save_predictions.exists() and not save_predictions.is_dir():
         raise InputError(f"--save-predictions {save_predictions}: must be a folder, not a file")
-    from rich.console import Console
-
     from memmlp.cli.train_summary import list_run_warnings, make_all_metrics_tables
     from memmlp.common.files import write_json
+    from memmlp.common.text_formats import make_console
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
     from memmlp.training.request import read_clip_rows
@@ -66,7 +65,7 @@ def evaluate(
     for line in (*filter(None, facts), *list_run_warnings(opened.run)):
         click.echo(line)
     for table in make_all_metrics_tables(opened.run, results, experiment.stage_ids):
-        Console(highlight=False).print(table)
+        make_console().print(table)
     if json_path is not None:
         write_json(json_path, {"mean": results, "clips": read_clip_rows(experiment, opened.run)})
     if save_predictions is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import outputs_option, plugins_option
+from memmlp.cli.options import PATH, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -38,7 +38,7 @@ class ExportForm(NamedTuple):
 
 @click.command("export")
 @click.argument("run")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="ONNX file to write.")
+@click.option("--out", required=True, type=PATH, help="ONNX file to write.")
 @click.option(
     "--graph",
     default="auto",

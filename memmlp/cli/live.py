@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from memmlp.cli.options import (
+    PATH,
     PORT,
     FiniteFloat,
+    HomePath,
     SenderNetwork,
     TargetAddress,
     add_page_options,
@@ -118,7 +120,7 @@ class LiveOptions(NamedTuple):
 )
 @click.option(
     "--calibration",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=HomePath(dir_okay=False),
     metavar="FILE",
     help="JSON file of the user's calibration. It is read at the start and updated by changes on the page.",
 )
@@ -136,7 +138,7 @@ class LiveOptions(NamedTuple):
 )
 @click.option(
     "--record",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FILE",
     multiple=True,
     help="New file for a recording (.npz, .bvh or .glb), written at the end; repeatable.",

@@ -18,6 +18,7 @@ from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.processes import collect_garbage_rarely, treat_termination_as_interrupt
 from memmlp.common.progress import send_announcements_to
+from memmlp.common.text_formats import print_in_any_encoding
 
 
 class Command(NamedTuple):
@@ -100,10 +101,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     Ctrl-C. With MEMMLP_TRACEBACK=1 in the environment, errors are raised with their traceback.
     """
     is_process = argv is None
+    print_in_any_encoding()
     if is_process:
         # By default torch's waiting threads spin, so a training on a busy machine takes five times longer.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         collect_garbage_rarely()
+        if outputs := os.environ.get("MEMMLP_OUTPUTS"):
+            os.environ["MEMMLP_OUTPUTS"] = os.path.expanduser(outputs)
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         with treat_termination_as_interrupt() if is_process else nullcontext():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from ipaddress import IPv4Network
 from pathlib import Path
@@ -15,7 +16,20 @@ if TYPE_CHECKING:
 
 Command = Callable[..., Any]
 PORT = click.IntRange(1, 65535)
-PATH = click.Path(path_type=Path)
+
+
+class HomePath(click.Path):
+    """A path; ~ at its start is the home folder, also where the shell does not expand it."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(path_type=Path, **options)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path."""
+        return super().convert(os.path.expanduser(value), param, ctx)
+
+
+PATH = HomePath()
 
 
 class FiniteFloat(click.FloatRange):
@@ -148,7 +162,7 @@ plugins_option = click.option(
 
 config_dir_option = click.option(
     "--config-dir",
-    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    type=HomePath(file_okay=False, exists=True),
     callback=_add_config_folder,
     expose_value=False,
     help="Folder of additional configs; they can refer to your own classes.",

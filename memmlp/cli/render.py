@@ -9,6 +9,7 @@ import click
 
 from memmlp.cli.options import (
     FiniteFloat,
+    HomePath,
     check_runs_exist,
     outputs_option,
     plugins_option,
@@ -28,7 +29,7 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
 @click.option(
     "--out",
     required=True,
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=HomePath(dir_okay=False),
     help="File to write: a figure (.png) or a film (.gif, .mp4).",
 )
 @click.option(

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import outputs_option, plugins_option
+from memmlp.cli.options import HomePath, outputs_option, plugins_option
 
 
 @click.command("report")
 @click.argument("sweeps", nargs=-1)
 @click.option(
     "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=HomePath(dir_okay=False),
     help="HTML file to write.  [default: report.html in --outputs]",
 )
 @click.option("--no-replays", is_flag=True, help="Write a smaller file, without 3D replays of clips.")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import (
+    HomePath,
     config_dir_option,
     outputs_option,
     plugins_option,
@@ -38,7 +39,7 @@ def results() -> None:
 @click.argument("overrides", nargs=-1)
 @click.option(
     "--out",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=HomePath(file_okay=False),
     default=FOLDER / "data",
     show_default=True,
     help="Folder for the results file.",
@@ -106,7 +107,7 @@ def save_command(
 
 folder_option = click.option(
     "--folder",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=HomePath(file_okay=False),
     default=FOLDER,
     show_default=True,
     help="Folder of the pages, with the subfolders data and templates.",
@@ -230,10 +231,10 @@ def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence
 
 
 @results.command("searches")
-@click.argument("folders", nargs=-1, type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("folders", nargs=-1, type=HomePath(exists=True, file_okay=False))
 @click.option(
     "--out",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=HomePath(file_okay=False),
     default=Path("searches"),
     show_default=True,
     help="Folder for trials.csv and summary.md.",

@@ -12,6 +12,7 @@ import click
 from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
 from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.errors import InputError
+from memmlp.common.text_formats import join_command
 from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
@@ -146,15 +147,14 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
         plan: the sweep's plan.
         labels: the labels of the variants to show.
     """
-    from rich.console import Console
-
+    from memmlp.common.text_formats import make_console
     from memmlp.sweep.progress_table import render
 
     shown = plan.select_variants(labels)
     click.echo(f"overrides: {' '.join(chosen.command_line) or 'none'}")  # other overrides make another sweep
     if shown.entries:
         states = shown.read_states()
-        Console(highlight=False).print(render(shown, states))
+        make_console().print(render(shown, states))
         done = [(e.label, shown.get_run(e).manifest) for e in shown.entries if states[e.key] == "done"]
         if done:
             from memmlp.report.tables.flags import flag_older_code  # imports SciPy, which is slow
@@ -208,10 +208,11 @@ def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, lab
     from memmlp.report.tables.measured_run import load_measured_run
     from memmlp.sweep.plan import FAULTY
 
-    plan, rounds, command = shown.plan, shown.rounds, " ".join([*arguments, *plugins.format_config_dir()])
+    plan, rounds = shown.plan, shown.rounds
+    command = join_command(["memmlp", "sweep", *arguments, *plugins.format_config_dir()])
     states = plan.read_states()
     failed = [task for task in plan.select_variants(labels).tasks if states[task.key] in FAULTY]
-    found = make_plan_table(shown, SHOWN_MODES["both"], f"memmlp sweep {command}", load_measured_run)
+    found = make_plan_table(shown, SHOWN_MODES["both"], command, load_measured_run)
     write_table(found.table, get_sweep_folder(chosen, plan.outputs))
     print_tables([found.table])
     for line in describe_end(rounds, chosen) if rounds else ():

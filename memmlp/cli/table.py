@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from memmlp.cli.options import (
+    HomePath,
     config_dir_option,
     outputs_option,
     plugins_option,
@@ -19,6 +20,7 @@ from memmlp.cli.options import (
     together_option,
 )
 from memmlp.common.errors import InputError
+from memmlp.common.text_formats import join_command
 from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
@@ -43,7 +45,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 )
 @click.option(
     "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=HomePath(dir_okay=False),
     help="File to write the table to; its suffix sets the format.",
 )
 @click.option(
@@ -243,18 +245,17 @@ def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
 
     tables = sorted(path.stem for path in find_packaged_folder("sweeps").glob("table*.yaml"))
     return [
-        (find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides, *format_config_dir()]))
+        (find_sweep(one, overrides), join_command(["memmlp", "sweep", one, *overrides, *format_config_dir()]))
         for one in (tables if name == "all" else [name])
     ]
 
 
 def print_tables(tables: Sequence[Table]) -> None:
     """Print tables for the width of the screen."""
-    from rich.console import Console
-
+    from memmlp.common.text_formats import make_console
     from memmlp.report.tables.table_text import print_table
 
-    console = Console(highlight=False, markup=False)
+    console = make_console()
     for one in tables:
         print_table(one, console)
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
 from memmlp.common.processes import MIN_CORE_FRACTION
+from memmlp.common.text_formats import make_console
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.measured_run import (
     CORE_FRACTION_KEYS,
@@ -50,7 +50,7 @@ def show(outcome: Outcome) -> None:
     lines.append(f"run      {run.folder}")
     if run.picture.exists():  # it needs matplotlib
         lines.append(f"picture  {run.picture}")
-    console = Console(highlight=False, markup=False)  # a folder's name may have brackets
+    console = make_console()  # a folder's name may have brackets
     for line in lines:
         console.print(line, soft_wrap=not isinstance(line, Table))
 
@@ -91,7 +91,7 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
         costs = [select_deployed_measurements(results[name]["latency"]) for name, _ in columns]
         table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
         table.add_row("parameters", "M", *(f"{cost['parameters'] / 1e6:.2f}" for cost in costs))
-    Console(highlight=False).print(table)
+    make_console().print(table)
 
 
 def _list_distinct_branches(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -11,11 +10,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import outputs_option, plugins_option
+from memmlp.cli.options import PATH, outputs_option, plugins_option
 from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
 from memmlp.common.overrides import Override
+from memmlp.common.text_formats import join_command
 
 if TYPE_CHECKING:
     from memmlp.sweep.plan import RunTask
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @click.option("--status", is_flag=True, help="Only show the search's progress.")
 @click.option(
     "--config-dir",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Folder of additional configs; they can refer to your own classes.",
 )
 @plugins_option
@@ -222,13 +222,12 @@ def _make_requests(setup: SearchSetup, values: Mapping[str, Value]) -> list[RunR
 
 def show(setup: SearchSetup) -> None:
     """Print the progress of the search."""
-    from rich.console import Console
-
+    from memmlp.common.text_formats import make_console
     from memmlp.sweep.search.progress_table import render
     from memmlp.sweep.search.study import Study
 
     study = Study.view(setup.search, setup.folder.name, setup.folder)
-    Console(highlight=False).print(render(study, setup.outputs) if study else "not started")
+    make_console().print(render(study, setup.outputs) if study else "not started")
 
 
 def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
@@ -273,9 +272,9 @@ def print_summary(setup: SearchSetup, study: Study) -> None:
 
     Exits with 1 if no trial is complete.
     """
-    from rich.console import Console
     from rich.text import Text
 
+    from memmlp.common.text_formats import make_console
     from memmlp.sweep.search.progress_table import (
         add_row,
         describe_counts,
@@ -291,7 +290,7 @@ def print_summary(setup: SearchSetup, study: Study) -> None:
     from memmlp.sweep.search.study import get_values
     from memmlp.training.request import describe_missing_data
 
-    console = Console(highlight=False)
+    console = make_console()
     best = study.list_best()
     if best:
         title = "Pareto front" if len(study.search.objectives) > 1 else "best trial"
@@ -313,7 +312,7 @@ def print_summary(setup: SearchSetup, study: Study) -> None:
     if best:
         unmeasured = 2 if setup.search.budget else 1  # the first overrides leave out export and evaluation
         words = setup.list_overrides(get_values(best[0], setup.search))[unmeasured:]
-        click.echo(f"next: memmlp train {shlex.join([*setup.config_options, *words])}")
+        click.echo("next: " + join_command(["memmlp", "train", *setup.config_options, *words]))
     else:
         reasons = [trial.user_attrs["reason"] for trial in study.trials if "reason" in trial.user_attrs]
         click.echo(f"no trial is complete; last failure: {(reasons or ['NaN errors'])[-1]}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,6 +14,7 @@ import click
 
 from memmlp.common.errors import InputError, import_optional
 from memmlp.common.overrides import Override
+from memmlp.common.processes import count_usable_cores
 
 if TYPE_CHECKING:
     from memmlp.sweep.controller import Fleet
@@ -236,6 +236,6 @@ def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[st
     presence = Presence(stem.with_suffix(".process"))
     gpu = executor.gpus and may_use_gpu
     local = workers.executor == "local"
-    threads = max((os.cpu_count() or 1) // count, 1) if local else 0
+    threads = max(count_usable_cores() // count, 1) if local else 0
     job = partial(work, str(path), threads, str(presence.path) if local else None, gpu)
     return path, Fleet(executor, job, count, folder / "workers", presence)

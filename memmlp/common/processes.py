@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import gc
+import math
 import os
 import signal
 import site
@@ -12,7 +13,9 @@ import sys
 import sysconfig
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
+CGROUPS = Path("/sys/fs/cgroup")
 GC_THRESHOLDS = (10_000, 20, 20)  # by default 700, 10 and 10
 
 MIN_CORE_FRACTION = 0.9  # below this fraction of a core, other processes disturbed a measurement
@@ -26,6 +29,32 @@ def collect_garbage_rarely() -> None:
     """
     gc.set_threshold(*GC_THRESHOLDS)
     atexit.register(gc.freeze)
+
+
+def count_usable_cores() -> int:
+    """Return the number of cores that this process may use: affinity, cgroup quota, Slurm's allocation."""
+    affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    limits = [float(affinity), *_read_cgroup_quotas(), *([float(slurm)] if slurm.isdecimal() else [])]
+    return max(math.ceil(min(limits)), 1)
+
+
+def _read_cgroup_quotas(process: Path = Path("/proc/self/cgroup"), root: Path = CGROUPS) -> Iterator[float]:
+    """Yield the CPU quotas, in cores, of the process's cgroups and their parents (versions 1 and 2)."""
+    with contextlib.suppress(OSError):
+        for line in process.read_text(encoding="utf-8").splitlines():
+            _, controllers, name = line.split(":", 2)
+            if controllers and "cpu" not in controllers.split(","):
+                continue
+            top = root / "cpu" if controllers else root
+            group = top / name.lstrip("/")
+            for folder in (group, *group.parents[: len(group.parts) - len(top.parts)]):
+                files = ("cpu.cfs_quota_us", "cpu.cfs_period_us") if controllers else ("cpu.max",)
+                with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
+                    words = " ".join((folder / file).read_text(encoding="utf-8") for file in files).split()
+                    quota, period = map(float, words)
+                    if quota > 0:
+                        yield quota / period
 
 
 @contextlib.contextmanager

@@ -116,9 +116,10 @@ def show_progress(
         unit: the unit of the count, such as frames.
     """
     from rich import progress  # imported here, since printing help does not need it
-    from rich.console import Console
 
-    console = Console(stderr=True)
+    from memmlp.common.text_formats import make_console
+
+    console = make_console(stderr=True)
     display = progress.Progress(
         progress.TextColumn("{task.description:<12}"),
         progress.BarColumn(bar_width=24),

@@ -22,6 +22,7 @@ from omegaconf.errors import (
 
 from memmlp.common.components import SLOTS, find_chosen_settings
 from memmlp.common.errors import InputError
+from memmlp.common.text_formats import join_command, make_override
 from memmlp.config.schema import Config
 
 
@@ -128,7 +129,9 @@ WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text
 def explain_error(error: Exception, overrides: Sequence[str]) -> str:
     """Return a line that explains an error while these overrides were composed."""
     if isinstance(error, OverrideParseException):
-        return f"{error.override}: cannot be parsed; expected KEY=VALUE, +KEY=VALUE or ~KEY"
+        key, equals, value = str(error.override).partition("=")
+        quoted = f"; quote a text: {join_command([make_override(key, value)])}" if equals else ""
+        return f"{error.override}: cannot be parsed; expected KEY=VALUE, +KEY=VALUE or ~KEY{quoted}"
     if isinstance(error, MissingConfigException):
         return _explain_missing_option(error)
     if isinstance(error, RecursionError):

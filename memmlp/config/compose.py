@@ -28,6 +28,7 @@ from memmlp.common.components import SLOTS, collect_attribute, collect_component
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import Override, parse_overrides, select_last_by_key
 from memmlp.common.settings import Settings
+from memmlp.common.text_formats import expand_home, join_command, make_override
 from memmlp.config import plugins
 from memmlp.config.check import check, describe_unknown_key, explain_error
 from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register_components
@@ -70,6 +71,7 @@ def parse_hydra_arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--info", "-i", nargs="?", const="all")
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_intermixed_args(list(argv))
+    args.overrides = list(map(expand_home, args.overrides))
     plugins.activate(plugins.find_named_packages(args.overrides))
     Plugins.instance().register(UserConfigs)
     register_components()
@@ -314,7 +316,7 @@ def _check_texts(cfg: DictConfig, overrides: Sequence[str]) -> None:
         )
         for item in items:
             if isinstance(item, int | float) and str(item) not in parts:
-                quoted = f"\"{typed.key}='{typed.value}'\""
+                quoted = join_command([make_override(typed.key, typed.value or "")])
                 raise InputError(f"{typed}: would become {item}; quote the value: {quoted}")
 
 

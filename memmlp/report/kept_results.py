@@ -19,6 +19,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, make_json_safe
+from memmlp.common.text_formats import join_command
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import Errors, MeasuredRun, Origin
 from memmlp.sweep.definition import Sweep
@@ -52,7 +53,7 @@ class KeptResults:
     @property
     def command(self) -> str:
         """The command that repeats the runs."""
-        return " ".join(["memmlp sweep", self.sweep, *self.overrides])
+        return join_command(["memmlp", "sweep", self.sweep, *self.overrides])
 
     @property
     def all_runs(self) -> list[MeasuredRun]:

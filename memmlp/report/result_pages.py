@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from memmlp.common.errors import InputError, import_optional
+from memmlp.common.text_formats import escape_markdown
 from memmlp.report.kept_results import KeptResults
 from memmlp.report.pictures.frontier_picture import draw_frontiers
 from memmlp.report.tables.frontier import COST_HEADINGS, has_frontier
@@ -19,7 +20,6 @@ from memmlp.report.tables.table_text import (
     MISSING,
     add_unit,
     count_decimals,
-    escape_markdown,
     find_unit,
     format_branch_effect,
     format_counts,

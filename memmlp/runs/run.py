@@ -18,6 +18,7 @@ import yaml
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, sync_folder, write_json
 from memmlp.common.lease import Lease, Lock, check_owner
+from memmlp.common.text_formats import join_command
 from memmlp.runs import deployment_folder, records
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import (
@@ -184,7 +185,7 @@ class Run:
         """
         deployment = self.preferred_deployment
         if self.done and not self.deployments.is_dir():
-            make = f"memmlp eval {self.folder} export.graph=auto"
+            make = join_command(["memmlp", "eval", str(self.folder), "export.graph=auto"])
             raise InputError(f"{self.folder}: does not have step.onnx; export it with {make}")
         file = deployment.accurate_int8_file or deployment.onnx
         digest = deployment.record.get("artifacts", {}).get(file.name)

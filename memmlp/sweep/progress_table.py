@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from memmlp.common.text_formats import make_console
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import describe_kind
 from memmlp.runs.metrics_log import LogRecord
@@ -43,7 +44,7 @@ class Screen:
     """The time of the last printed line, by time.monotonic; None before the first line."""
 
     def __init__(self, console: Console | None = None):
-        self.console = console or Console(highlight=False, stderr=True)
+        self.console = console or make_console(stderr=True)
         self.live = Live(console=self.console, refresh_per_second=4, transient=False)
 
     def __enter__(self) -> Self:

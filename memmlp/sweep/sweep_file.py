@@ -31,8 +31,9 @@ from typing import Any
 
 import yaml
 
-from memmlp.common.errors import InputError, describe_read_error
+from memmlp.common.errors import InputError, describe_read_error, escape_line_breaks
 from memmlp.common.overrides import format_value
+from memmlp.common.plain_yaml import parse_yaml
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.sweep.definition import (
     BRANCHES,
@@ -52,21 +53,6 @@ VARIANT_KEYS = ("overrides", "branch", "against", "paper", "note", "confounded")
 BASE = "base"  # the variant's label in a sweep without variants and grids
 
 
-class UniqueKeys(yaml.SafeLoader):
-    """A safe YAML loader that rejects duplicate keys. PyYAML's own silently takes the last value."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return the mapping. Raises ConstructorError for a duplicate key."""
-        seen = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"duplicate key '{key.value}'", key.start_mark
-                )
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
 def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: None) -> Sweep:
     """Read a sweep file.
 
@@ -78,7 +64,7 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
         InputError: for invalid content; the message names the file and the key.
     """
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
+        content = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: {describe_read_error(error)}; expected a readable sweep file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -141,7 +127,6 @@ def parse_sweep(name: str, content: Any) -> Sweep:
 
 
 def _parse_variants(value: Any, branch: str) -> list[Variant]:
-    # YAML may have read a label as a number.
     variants = [
         _parse_variant(str(label), fields, branch)
         for label, fields in _parse_mapping(value, "variants").items()
@@ -149,7 +134,7 @@ def _parse_variants(value: Any, branch: str) -> list[Variant]:
     if len({variant.label for variant in variants}) < len(variants):
         raise InputError("variants: two variants have the same label")
     for variant in variants:
-        if not variant.label.isprintable():
+        if not variant.label.strip() or escape_line_breaks(variant.label) != variant.label:
             raise InputError(f"variants: {variant.label!r}; expected a label in one line")
     return variants
 

@@ -10,9 +10,10 @@ import torch
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
+from memmlp.common.processes import count_usable_cores
 
 NVIDIA_DRIVER = Path("/dev/nvidiactl")  # made on Linux by the driver of NVIDIA's GPUs
-DEFAULT_THREADS = torch.get_num_threads()  # before any run has set another number
+DEFAULT_THREADS = min(torch.get_num_threads(), count_usable_cores())  # before any run has set another number
 
 
 def choose_device(name: str) -> torch.device:

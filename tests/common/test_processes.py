@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import memmlp
+from memmlp.common import processes
 from memmlp.common.processes import (
     build_import_variables,
     finish_uninterrupted,
@@ -55,3 +56,28 @@ def test_an_end_that_has_begun_is_not_interrupted_and_a_request_to_end_is_a_ctrl
     with pytest.raises(KeyboardInterrupt), treat_termination_as_interrupt():
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_usable_cores_follow_affinity_and_slurm(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(processes, "_read_cgroup_quotas", lambda: [])
+    monkeypatch.setattr(processes.os, "sched_getaffinity", lambda process: {*range(8)}, raising=False)
+    monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
+    assert processes.count_usable_cores() == 8
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "4")
+    assert processes.count_usable_cores() == 4
+    monkeypatch.setattr(processes, "_read_cgroup_quotas", lambda: [2.5])
+    assert processes.count_usable_cores() == 3
+
+
+def test_quotas_of_both_cgroup_versions(tmp_path: Path):
+    (tmp_path / "cgroup").write_text("4:cpu,cpuacct:/job\n0::/user/job\n")
+    files = {
+        "user/cpu.max": "150000 100000\n",
+        "user/job/cpu.max": "max 100000\n",
+        "cpu.max": "400000 100000\n",
+    }
+    files |= {"cpu/job/cpu.cfs_quota_us": "50000\n", "cpu/job/cpu.cfs_period_us": "100000\n"}
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert sorted(processes._read_cgroup_quotas(tmp_path / "cgroup", tmp_path)) == [0.5, 1.5, 4.0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import click
 from memmlp.cli.data.printing import describe_amount, show_skipped, show_some
 from memmlp.cli.options import PATH, body_option, strict_option
 from memmlp.common.errors import InputError
+from memmlp.common.text_formats import join_command, make_override
 
 skeleton_option = click.option(
     "--skeleton",
@@ -75,7 +75,8 @@ def import_(
     click.echo(f"{describe_amount(len(report.clips), seconds)}, skeleton {maps}, in {out}")
     grouping = choose_grouping([Path(clip.clip).with_suffix("").as_posix() for clip in report.clips])
     group_overrides = [f"data/grouping@data.split={grouping}"] if grouping else []
-    click.echo("next: " + shlex.join(["memmlp", "train", "data=mocap", f"data.root={out}", *group_overrides]))
+    words = ["memmlp", "train", "data=mocap", make_override("data.root", str(out)), *group_overrides]
+    click.echo(f"next: {join_command(words)}")
 
 
 def _parse_rates(texts: Sequence[str]) -> dict[str, float]:
@@ -173,7 +174,8 @@ def guess(file: Path, out: Path | None) -> None:
     click.echo(
         f"imports from {converted.fitted.stance.source}, with {faults} fault{'s' * (faults != 1)}", err=True
     )
-    click.echo(f"next: memmlp data skeleton show {file} --skeleton {out or 'MAP'} --out PNG", err=True)
+    words = ["memmlp", "data", "skeleton", "show", str(file), "--skeleton", str(out or "MAP"), "--out", "PNG"]
+    click.echo(f"next: {join_command(words)}", err=True)
 
 
 @skeleton.command("show")

@@ -8,10 +8,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 from rich.table import Table
 
 from memmlp.common.errors import escape_line_breaks
+from memmlp.common.text_formats import make_console
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import INTERPOLATED, SkippedFile
 from memmlp.motion.preparing.find_clips import get_source_name
@@ -35,7 +35,7 @@ def show_manifest(manifest: Manifest) -> None:
         table.add_column(name, justify="right")
     for part, total in manifest.totals.items():
         table.add_row(part, str(total.clips), str(total.frames), f"{total.hours:.3f}")
-    Console(highlight=False).print(table)
+    make_console().print(table)
     for source in manifest.sources:
         clips = tuple(clip for clip in manifest.clips if get_source_name(clip.name) == source)
         totals = replace(manifest, clips=clips).totals.items()
@@ -71,7 +71,7 @@ def show_persons(manifest: Manifest) -> None:
         table.add_column(name, justify="right")
     for (part, person), own in sorted(clips.items()):
         table.add_row(part, person, str(len(own)), f"{sum(own) / FPS / 60:.1f}")
-    Console(highlight=False).print(table)
+    make_console().print(table)
 
 
 def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
 from rich.table import Table
 
 from memmlp.cli.options import outputs_option
@@ -18,10 +17,10 @@ from memmlp.cli.runs.show import (
     format_age,
     format_value,
     list_outdated_results,
-    make_console,
     make_plain_table,
     read_record,
 )
+from memmlp.common.text_formats import make_console
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import describe_kind
@@ -190,11 +189,11 @@ def _print_table(records: Sequence[Record], keys: Sequence[str], keys_requested:
     """
     columns = _make_columns(records, keys, keys_requested)
     removable = ["age"] if keys_requested else [*REMOVABLE_COLUMNS, *reversed(keys[:MAX_COLUMNS])]
-    wide = Console(width=10_000)
+    wide = make_console(width=10_000)
     limit = make_console().width
     while (width := wide.measure(_make_table(columns, keys_requested)).minimum) > limit and removable:
         columns.pop(removable.pop(0), None)
-    shown = Console(highlight=False, markup=False, width=max(limit, width))
+    shown = make_console(width=max(limit, width))
     shown.print(_make_table(columns, keys_requested))
     return [key for key in keys if key not in columns]
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from memmlp.cli.options import outputs_option
 from memmlp.common.errors import InputError
+from memmlp.common.text_formats import make_console
 from memmlp.evaluation.metric_facts import UNITS
 
 if TYPE_CHECKING:
@@ -215,11 +215,6 @@ def list_outdated_results(run: Run) -> dict[str, str]:
     except InputError:  # `read_record` reports it
         return {}
     return {f"{mode} results": f"by an earlier version: {changes}" for mode, changes in outdated.items()}
-
-
-def make_console() -> Console:
-    """Make a console that prints text unchanged."""
-    return Console(highlight=False, markup=False)
 
 
 def make_plain_table(*columns: str, title: str | None = None) -> Table:

@@ -7,7 +7,8 @@ from pathlib import Path
 import click
 
 from memmlp.cli.options import PATH, FiniteFloat, outputs_option
-from memmlp.cli.runs.show import format_age, make_console, make_plain_table
+from memmlp.cli.runs.show import format_age, make_plain_table
+from memmlp.common.text_formats import make_console
 
 
 @click.command("tag")

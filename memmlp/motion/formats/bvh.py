@@ -27,6 +27,8 @@ from memmlp.motion.formats.recording import END, Recording
 AXES = "XYZ"
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
 LIMIT = 1e6  # maximum absolute value of all numbers in the file
+WORD = re.compile(r"(?<![^\s{}])(ROOT|JOINT)\s+([^{}]*[^{}\s])|([{}]|[^\s{}]+)", re.IGNORECASE)
+"""A word of the hierarchy, or a keyword with a name; names may contain blanks."""
 MAX_JOINTS = 1000
 MAX_BYTES = 2**28  # about half an hour with 93 channels at 120 Hz
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, because the header has few digits
@@ -148,7 +150,8 @@ class _WordReader:
         for self.line, line in lines:
             if line.strip().upper() == "MOTION":
                 return
-            yield from line.replace("{", " { ").replace("}", " } ").split()
+            for match in WORD.finditer(line):
+                yield from filter(None, match.groups())
         raise InputError(f"{self.path}: has no MOTION line; expected HIERARCHY, then MOTION")
 
     def fail(self, wrong: str, expected: str) -> NoReturn:

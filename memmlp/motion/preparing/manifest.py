@@ -176,7 +176,7 @@ class Manifest:
         """
         path = out / MANIFEST
         try:
-            data = json.loads(path.read_text())
+            data = json.loads(path.read_text(encoding="utf-8"))
             if data["format"] != FORMAT:
                 raise InputError(
                     f"{path}: has format {data['format']}; must be {FORMAT}; prepare the data again"

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
+from memmlp.common.text_formats import join_command
 from memmlp.report.tables.effects import (
     RunsBySeed,
     compare_branches,
@@ -110,7 +111,9 @@ def make_table(
     branches = compare_branches(shown, runs, MODES) if has_errors else {}
     if rounds:  # their numbers of seeds were chosen by verdicts on other branches
         branches = {branch: _drop_verdicts(found) for branch, found in branches.items()}
-    flags = find_flags(shown, sweep, runs, command or f"memmlp sweep {sweep.name}", describe_run)
+    flags = find_flags(
+        shown, sweep, runs, command or join_command(["memmlp", "sweep", sweep.name]), describe_run
+    )
     rows = (_make_row(shown, one, runs.get(one.label), shown_modes, effects) for one in shown.variants)
     return Table(
         name=sweep.name,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import re
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from rich.console import Console
 
 from memmlp.common.files import make_json_safe
+from memmlp.common.text_formats import escape_latex, escape_markdown
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.tables.flags import join_quoted
 from memmlp.report.tables.statistics import Verdict
@@ -29,13 +29,6 @@ ARROWS = {"lower": "↓", "higher": "↑"}
 
 COLUMN_GAP = "  "  # text between columns on a terminal
 MAX_LABEL_WIDTH = 18  # maximum width of the variant column on a terminal, characters
-TEX_ESCAPES = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
-    "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", MINUS: "$-$",
-    "↓": r"$\downarrow$", "↑": r"$\uparrow$", "✓": r"$\checkmark$", "✗": r"$\times$",
-    CONFOUNDED: r"$\ddagger$", "²": r"\textsuperscript{2}", "³": r"\textsuperscript{3}", "<": r"$<$",
-    ">": r"$>$",
-}  # fmt: skip
 
 Line = tuple[tuple[str, ...], ...]
 """A line of cells: variant, seeds, and one cell for each metric. A cell has one to five parts."""
@@ -382,26 +375,21 @@ def to_markdown(table: Table) -> str:
     return "\n\n".join([*parts, remarks] if remarks else parts) + "\n"
 
 
-def escape_markdown(text: str) -> str:
-    """Escape all characters that Markdown would interpret."""
-    return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
-
-
 def to_latex(table: Table) -> str:
     """Return a LaTeX table for the packages booktabs and amssymb."""
     lines = ["% needs \\usepackage{booktabs,amssymb}", r"\begin{table}", r"\centering", r"\small"]
-    lines.append(rf"\caption{{{_escape_tex(make_caption(table))}}}")
+    lines.append(rf"\caption{{{escape_latex(make_caption(table))}}}")
     lines.append(rf"\begin{{tabular}}{{ll{'r' * len(table.metrics)}}}")
     lines.append(r"\toprule")
     for number, grid in enumerate(make_grids(table)):
         columns = len(grid.header)
         lines += [r"\midrule"] if number else []
         lines += [rf"\multicolumn{{{columns}}}{{l}}{{\emph{{{grid.mode} mode}}}} \\"] if grid.mode else []
-        lines += [" & ".join(map(_escape_tex, grid.header)) + r" \\", r"\midrule"]
-        lines += [" & ".join(map(_escape_tex, line)) + r" \\" for line in grid.lines]
+        lines += [" & ".join(map(escape_latex, grid.header)) + r" \\", r"\midrule"]
+        lines += [" & ".join(map(escape_latex, line)) + r" \\" for line in grid.lines]
     lines += [r"\bottomrule", r"\end{tabular}"]
     lines += [
-        rf"\par\smallskip\raggedright\footnotesize {_escape_tex(line)}." for line in _list_remarks(table)
+        rf"\par\smallskip\raggedright\footnotesize {escape_latex(line)}." for line in _list_remarks(table)
     ]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
 
@@ -435,10 +423,6 @@ FORMATS: dict[str, Callable[[Table], str]] = {"md": to_markdown, "tex": to_latex
 
 def _list_remarks(table: Table) -> list[str]:
     return [*make_legend(table), *table.flags, *table.notes]
-
-
-def _escape_tex(text: str) -> str:
-    return "".join(TEX_ESCAPES.get(letter, letter) for letter in text)
 
 
 def _divide_columns(grid: Grid, width: int) -> list[list[int]]:

@@ -10,10 +10,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings, setting
+from memmlp.common.text_formats import make_key, make_sqlite_url
 from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
 if TYPE_CHECKING:
@@ -68,7 +70,7 @@ class MLflow:
     @property
     def place(self) -> str:
         """The URI of MLflow's tracking store."""
-        local = f"sqlite:///{self.outputs.absolute() / 'mlflow.db'}"
+        local = make_sqlite_url(self.outputs.absolute() / "mlflow.db")
         return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or local
 
     def fingerprint(self, run_id: str) -> str | None:
@@ -84,11 +86,11 @@ class MLflow:
         with self.client() as (client, experiment):
             tags = {"memmlp.run_id": facts.id} | _build_tags(facts)
             run_id = _replace_run(client, experiment, "memmlp.run_id", facts.name, tags, facts.started)
-            params = [Param(key, value[:PARAM_LENGTH]) for key, value in facts.config.items()]
+            params = [Param(_make_key(key), value[:PARAM_LENGTH]) for key, value in facts.config.items()]
             for batch in _split_into_batches(params, PARAMS):
                 client.log_batch(run_id, params=batch)
             name, digest = facts.data  # MLflow allows 36 characters of a digest; a tag has all of it
-            client.log_inputs(run_id, [DatasetInput(Dataset(name, digest[:36], "local", "{}"), [])])
+            client.log_inputs(run_id, [DatasetInput(Dataset(name[:500], digest[:36], "local", "{}"), [])])
         shown = ShownInMLflow(self, run_id)
         shown.log(points)
         return shown
@@ -106,14 +108,22 @@ class MLflow:
             logging.getLogger(package).setLevel(logging.CRITICAL)
         self.outputs.mkdir(parents=True, exist_ok=True)
         local = self.place.startswith("sqlite:")
+        if self.place == make_sqlite_url(database := self.outputs.absolute() / "mlflow.db"):
+            database.touch()  # with the modes of other files; SQLite's own are 0644
         with FileLock(self.outputs / ".mlflow.lock") if local else contextlib.nullcontext():
             client = MlflowClient(tracking_uri=self.place)
             if client.get_experiment_by_name(EXPERIMENT) is None:
                 artifacts = (self.outputs.absolute() / "mlflow-artifacts").as_uri() if local else None
                 with contextlib.suppress(MlflowException):  # another process has created it meanwhile
                     client.create_experiment(EXPERIMENT, artifact_location=artifacts)
+            with contextlib.suppress(OSError):  # MLflow makes an empty folder with the URL's escapes
+                stray = Path(quote(str(self.outputs.absolute())))
+                if stray != self.outputs.absolute():
+                    os.removedirs(stray)
             experiment = client.get_experiment_by_name(EXPERIMENT)
             assert experiment is not None
+            if experiment.lifecycle_stage == "deleted":
+                client.restore_experiment(experiment.experiment_id)
             yield client, experiment.experiment_id
 
 
@@ -166,7 +176,9 @@ def _send_points(client: MlflowClient, mlflow_id: str, points: Sequence[CurvePoi
     from mlflow.entities import Metric
 
     for batch in _split_into_batches(points, METRICS):
-        metrics = [Metric(point.key, point.value, int(point.time * 1000), point.step) for point in batch]
+        metrics = [
+            Metric(_make_key(point.key), point.value, int(point.time * 1000), point.step) for point in batch
+        ]
         client.log_batch(mlflow_id, metrics=metrics)
 
 
@@ -174,9 +186,13 @@ def _split_into_batches(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
     return (list(items[start : start + size]) for start in range(0, len(items), size))
 
 
+def _make_key(text: str) -> str:
+    return make_key(text, r"\w. :/-", 250)
+
+
 def _build_tags(facts: RunFacts) -> dict[str, str]:
     tags = {f"memmlp.{key.replace(' ', '_')}": value for key, value in facts.origin.items()}
-    tags |= {f"memmlp.label.{label}": "yes" for label in facts.tags}
+    tags |= {_make_key(f"memmlp.label.{label}"): label for label in facts.tags}
     given = {
         "memmlp.folder": str(facts.folder),
         "mlflow.source.name": "memmlp",

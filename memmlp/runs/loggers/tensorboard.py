@@ -12,8 +12,10 @@ from typing import Any
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings
+from memmlp.common.text_formats import escape_markdown, make_key
 from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
+MAX_BYTES = 255  # of a file system
 MAX_NAME = 120  # maximum length of a folder name, characters
 FINGERPRINT = "memmlp-fingerprint"
 
@@ -76,7 +78,9 @@ class ShownInTensorBoard:
     def log(self, points: Sequence[CurvePoint]) -> None:
         """Write points to disk."""
         for point in points:
-            self.writer.add_scalar(point.key, point.value, point.step, walltime=point.time)
+            self.writer.add_scalar(
+                make_key(point.key, r"a-zA-Z0-9_./-", 500), point.value, point.step, walltime=point.time
+            )
         self.writer.flush()
 
     def write_texts(self, texts: Mapping[str, str]) -> None:
@@ -97,10 +101,17 @@ class ShownInTensorBoard:
 
 
 def _format_table(key: str, value: str, rows: Mapping[str, Any]) -> str:
-    return "\n".join([f"| {key} | {value} |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())])
+    return "\n".join(
+        [
+            f"| {key} | {value} |",
+            "|---|---|",
+            *(f"| {escape_markdown(k)} | {escape_markdown(str(v))} |" for k, v in rows.items()),
+        ]
+    )
 
 
 def _make_folder_name(name: str, run_id: str = "") -> str:
     """Return the folder name that TensorBoard shows for a run: its name and the first digits of its id."""
     ending = f" · {run_id[:8]}" if run_id else ""
-    return re.sub(r"[^\w=.,·+() -]", "_", name)[: MAX_NAME - len(ending)] + ending
+    safe = re.sub(r"[^\w=.,·+() -]", "_", name)[: MAX_NAME - len(ending)]
+    return safe.encode()[: MAX_BYTES - len(ending.encode())].decode(errors="ignore") + ending

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
 import time
@@ -13,7 +14,7 @@ from typing import Any
 
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
-from memmlp.common.settings import Settings, setting, text
+from memmlp.common.settings import Settings, matching, setting
 from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
 OFFLINE = {"WANDB_MODE": "offline", "WANDB_SILENT": "true", "WANDB_ERROR_REPORTING": "false"}
@@ -25,7 +26,10 @@ FINGERPRINT = "memmlp-fingerprint"
 class WandBSettings(Settings):
     """Writes runs as W&B offline runs to outputs/wandb (needs pip install 'memmlp[wandb]')."""
 
-    project: str = setting(text(), "memmlp")  # the project that `wandb sync` uploads to
+    # the project that `wandb sync` uploads to
+    project: str = setting(
+        matching(r"[^/\\#?%:\n]{1,128}", "text without / \\ # ? % : and line breaks"), "memmlp"
+    )
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,7 @@ class ShownInWandB:
         """Write results to the summary and upload files, then set the final status."""
         self.run.summary.update({point.key: point.value for point in facts.results} | facts.texts)
         for path in facts.files:
-            self.run.save(str(path), base_path=str(facts.folder), policy="now")
+            self.run.save(glob.escape(str(path)), base_path=str(facts.folder), policy="now")
         self.run.finish(exit_code=0 if facts.status == "done" else 1)
         (self.folder / FINGERPRINT).write_text(facts.fingerprint)
 

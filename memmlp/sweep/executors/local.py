@@ -16,8 +16,10 @@ from memmlp.common.errors import InputError
 from memmlp.common.processes import (
     build_import_variables,
     collect_garbage_rarely,
+    count_usable_cores,
     treat_termination_as_interrupt,
 )
+from memmlp.common.text_formats import print_in_any_encoding
 from memmlp.sweep.executors import Work
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -74,7 +76,7 @@ def count_workers(gpu_groups: Sequence[GpuGroup], workers: int | None, per_gpu: 
     if not gpu_groups:
         if per_gpu:
             raise InputError(f"--workers-per-gpu {per_gpu}: this machine has no GPUs for workers")
-        return workers or os.cpu_count() or 1
+        return workers or count_usable_cores()
     most = len(gpu_groups) * (per_gpu or 1)
     if workers and per_gpu and workers > most:
         raise InputError(f"--workers {workers}: must be at most {most} with --workers-per-gpu {per_gpu}")
@@ -124,7 +126,7 @@ class LocalExecutor:
         self.workers = [(worker, number) for worker, number in self.workers if worker.alive()]
         users = [number for _, number in self.workers]
         least = min(range(len(self.gpu_groups)), key=users.count)
-        folder = Path(str(self.folder).replace("%j", uuid.uuid4().hex[:12]))
+        folder = self.folder.with_name(self.folder.name.replace("%j", uuid.uuid4().hex[:12]))
         process = start_process(work, folder, {VISIBLE: ",".join(self.gpu_groups[least])})
         self.workers.append((Worker(process, folder), least))
         return self.workers[-1][0]
@@ -158,6 +160,7 @@ def start_process(
 def do_work(folder: Path) -> None:
     """Do the work that is pickled in a worker's folder. It is called in the worker's process."""
     collect_garbage_rarely()
+    print_in_any_encoding()
     work: Work = pickle.loads((folder / WORK).read_bytes())
     (folder / WORK).unlink()
     with treat_termination_as_interrupt():

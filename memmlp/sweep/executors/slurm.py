@@ -16,6 +16,7 @@ import submitit.helpers
 
 from memmlp.common.errors import InputError
 from memmlp.common.processes import collect_garbage_rarely, pass_import_paths_to_children
+from memmlp.common.text_formats import print_in_any_encoding
 from memmlp.sweep.executors import Work
 
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
@@ -113,6 +114,7 @@ class RequeuedWork:
     def __call__(self) -> str | None:
         """Do the work. submitit calls this in the job's process."""
         collect_garbage_rarely()
+        print_in_any_encoding()
         return self.work()
 
     def checkpoint(self) -> Any:
@@ -169,10 +171,11 @@ class Slurm:
         options: the options of the jobs.
 
     Raises:
-        InputError: if Slurm is not installed.
+        InputError: if Slurm is not installed, or could not use the folder.
     """
 
     def __init__(self, folder: Path, options: SlurmOptions):
+        _check_folder(folder)
         with _convert_errors():
             self.executor = SubmititSlurm(folder=folder, python=options.python)
             self.executor.set_options(options)
@@ -189,11 +192,19 @@ class Slurm:
 
 def format_batch_script(folder: Path, options: SlurmOptions, workers: int) -> str:
     """Return the text of the sbatch script for this number of workers, also on machines without Slurm."""
+    _check_folder(folder)
     executor = UnsentSlurm(folder=folder, python=options.python)
     executor.set_options(options)
     if workers > 1:
         executor.parameters["map_count"] = workers
     return executor._make_submission_file_text(executor._submitit_command_str, "worker")
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise InputError for a folder with characters that Slurm or submitit would replace in log paths."""
+    path = folder.absolute().parent
+    if not str(path).isprintable() or set(str(path)) & {*"%\\"}:
+        raise InputError(f"executor=slurm: {path}: must not contain % or \\ or control characters; rename it")
 
 
 @contextlib.contextmanager

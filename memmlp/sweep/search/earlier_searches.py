@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.common.overrides import parse_overrides
+from memmlp.common.plain_yaml import parse_yaml
+from memmlp.common.text_formats import format_csv, parse_csv
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import Search, Value
 
@@ -48,7 +46,7 @@ class FinishedSearch:
         self.overrides = (*content["base"], *content["command_line"])
         model = [one.text for one in parse_overrides(self.overrides) if one.group == "model"]
         self.network = " ".join(model) or "model=mem_mlp"
-        self.trials = list(csv.DictReader(io.StringIO(path.read_text())))
+        self.trials = parse_csv(path.read_text(encoding="utf-8"))
         complete = [row for row in self.trials if row["state"] == "complete"]
         self.complete = sorted(complete, key=lambda row: float(row[self.objective]))
 
@@ -57,7 +55,7 @@ class FinishedSearch:
         """The values of the best trial by key. Raises InputError if no trial is complete."""
         if not self.complete:
             raise InputError(f"{self.folder}: no trial is complete; expected a search with a best trial")
-        return {key: yaml.safe_load(text) for key in self.keys if (text := self.complete[0][key])}
+        return {key: parse_yaml(text) for key in self.keys if (text := self.complete[0][key])}
 
     def measure_compute(self, row: Mapping[str, str]) -> list[float]:
         """Return the recorded compute of a trial's runs, TFLOP."""
@@ -81,17 +79,16 @@ def format_trials(searches: Sequence[FinishedSearch]) -> str:
         *keys,
         "run",
     ]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
+    rows: list[list[Any]] = [columns]
     for search in searches:
         name, budget = search.objective, search.content["tflop"]
         about: dict[str, Any] = {"search": search.folder.name, "network": search.network, "budget": budget}
         for row in search.trials:
             tflop = " ".join(f"{one:.4g}" for one in search.measure_compute(row))
             result = {"objective": name, "value": row[name], "sd": row.get(f"{name} sd"), "tflop": tflop}
-            writer.writerow({**row, **about, **result})
-    return text.getvalue()
+            cells = {**about, **result}
+            rows.append([cells.get(column, row.get(column)) for column in columns])
+    return format_csv(rows)
 
 
 def format_summary(searches: Sequence[FinishedSearch]) -> Iterator[str]:

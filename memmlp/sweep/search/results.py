@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 import warnings
@@ -21,6 +19,8 @@ from optuna.trial import FrozenTrial, TrialState
 from memmlp.common.errors import import_optional
 from memmlp.common.files import atomic_write
 from memmlp.common.overrides import select_last_by_key
+from memmlp.common.plain_yaml import parse_yaml
+from memmlp.common.text_formats import format_csv
 from memmlp.sweep.search.study import Study, compute_deviations, get_reason, get_values
 
 IMPORTANCE = "keys in which the best tenth of the trials differs from the others"
@@ -43,9 +43,7 @@ def write_trials(study: Study, path: Path) -> None:
     seeds = range(1, search.seeds + 1) if search.seeds > 1 else ()
     seed_columns = [f"{name} sd" for name in names] if seeds else []
     seed_columns += [f"{name}, run {number}" for number in seeds for name in names]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["trial", "state", *names, *seed_columns, *keys, "run", "reason"])
+    rows: list[list[Any]] = [["trial", "state", *names, *seed_columns, *keys, "run", "reason"]]
     for trial in study.trials:
         figures = trial.values if trial.state == TrialState.COMPLETE else [""] * len(names)
         by_seed: list[Any] = []
@@ -54,8 +52,8 @@ def write_trials(study: Study, path: Path) -> None:
             by_seed = by_seed or [""] * len(seed_columns)
         params = [trial.params.get(key, "") for key in keys]
         extra = [" ".join(trial.user_attrs.get("runs", ())), get_reason(trial)]
-        writer.writerow([trial.number, trial.state.name.lower(), *figures, *by_seed, *params, *extra])
-    atomic_write(path, text.getvalue())
+        rows.append([trial.number, trial.state.name.lower(), *figures, *by_seed, *params, *extra])
+    atomic_write(path, format_csv(rows))
 
 
 def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
@@ -102,7 +100,7 @@ def format_experiment(study: Study, trial: FrozenTrial, groups: Collection[str])
         node = tree
         for name in parents:
             node = node.setdefault(name, {})
-        node[leaf] = yaml.safe_load(override.value or "")
+        node[leaf] = parse_yaml(override.value or "")
     head = (
         f"# @package _global_\n# Trial {trial.number} of {len(study.trials)} of the search {search.name}: "
         f"{', '.join(o.text for o in search.objectives)} on validation "

@@ -229,3 +229,9 @@ def test_the_skeleton_is_recognised(tmp_path: Path):
     report = import_folder(tmp_path / "clip.bvh", tmp_path / "back", ImportSettings(floor=NONE))
     assert [(each.skeleton, each.faults) for each in report.clips] == [("smpl_words", ())]
     check_same(clip, read_clip(tmp_path / "back" / "clip.npz", "clip"))
+
+
+def test_names_may_have_blanks(tmp_path: Path):
+    text = "HIERARCHY\nROOT Bip01  Pelvis {\nOFFSET 0 0 0\nCHANNELS 1 Xposition\nJoint Bip01 L Thigh\n"
+    text += "{ OFFSET 0 1 0\nCHANNELS 0 }\n}\nMOTION\nFrames: 1\nFrame Time: 0.01\n0\n"
+    assert read_bvh(write(tmp_path, text)).nodes == ("Bip01  Pelvis", "Bip01 L Thigh")

@@ -1,6 +1,7 @@
 """MLflow shows what the run folder holds, once, and replaces what it had."""
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,7 @@ def test_what_changed_replaces_the_run(store: Path, tmp_path: Path):
     outdated = an_outdated_evaluation(run)
     sync_runs(logger, [run], print)
     tags = shown(store)[run.id].data.tags
-    assert (tags["memmlp.label.good"], tags["mlflow.note.content"]) == ("yes", "a note")
+    assert (tags["memmlp.label.good"], tags["mlflow.note.content"]) == ("good", "a note")
     assert tags["memmlp.outdated_results"].startswith("stream (mode.stream 0 -> ")
     remove_tags(run, ["good"])
     set_note(run, "")
@@ -143,3 +144,28 @@ def test_a_server_that_is_not_there_is_told(tmp_path: Path):
     said: list[str] = []
     assert sync_runs(MLflow("http://127.0.0.1:9", tmp_path), [begun(tmp_path)], said.append) == {"failed": 1}
     assert said[0].startswith(f"run {'0' * 16} is not shown in mlflow: ")
+
+
+@pytest.mark.parametrize("name", ["a?b#c 50%", "a%20b"])
+def test_any_folder_and_any_tag(tmp_path: Path, name: str):
+    outputs, tags = tmp_path / name / "outputs", ["a+b", "a//b", "v1/../y", "é"]
+    run = a_run(outputs)
+    add_tags(run, tags)
+    before = os.umask(0o002)
+    try:
+        assert sync_runs(MLflow(None, outputs), [run], print) == {"shown": 1}
+    finally:
+        os.umask(before)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+    assert (outputs / "mlflow.db").stat().st_mode & 0o777 == 0o664
+    found = shown(outputs)[run.id].data.tags
+    assert {value for key, value in found.items() if key.startswith("memmlp.label.")} == {*tags}
+
+
+def test_a_deleted_experiment_is_restored_without_replaced_runs(tmp_path: Path):
+    logger, run = MLflow(None, tmp_path), a_run(tmp_path)
+    sync_runs(logger, [run, run], print, full=True)
+    with logger.client() as (client, experiment):
+        client.delete_experiment(experiment)
+    assert sync_runs(logger, [run], print) == {"shown": 1}
+    assert [*shown(tmp_path)] == [run.id]

@@ -90,3 +90,10 @@ def test_visible_gpus_are_those_of_the_variable_or_all(monkeypatch, text: str | 
         monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
         monkeypatch.setattr(torch.cuda, "device_count", lambda: text)
     assert list_visible_gpus() == found
+
+
+def test_only_the_last_part_of_the_log_path_is_replaced(tmp_path: Path):
+    (handle,) = LocalExecutor(tmp_path / "p%j" / "%j").submit((tmp_path / "done").touch)
+    assert handle.folder.parent == tmp_path / "p%j"
+    assert handle.folder.name != "%j"
+    handle.process.wait()

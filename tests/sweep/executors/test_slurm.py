@@ -128,3 +128,11 @@ def test_preempted_work_is_queued_again(tmp_path: Path):
     work = RequeuedWork(partial((tmp_path / "again").write_text, "done"))
     work.checkpoint().function()
     assert (tmp_path / "again").exists()
+
+
+def test_a_folder_that_slurm_would_change_is_refused(tmp_path: Path):
+    for name in ("p%j", "50%", "a\\b", "a\nb"):
+        with pytest.raises(InputError, match="must not contain %"):
+            format_batch_script(tmp_path / name / "workers" / "%j", SlurmOptions(), 1)
+    script = format_batch_script(tmp_path / "a b $c" / "%j", SlurmOptions(), 1)
+    assert f"#SBATCH --output='{tmp_path}/a b $c/%j/%j_0_log.out'" in script
