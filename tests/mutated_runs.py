@@ -134,7 +134,7 @@ def mutate_archive(whole: Path, path: Path, dice: random.Random) -> None:
     method = dice.choice([zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2]) if kind == "method" else zipfile.ZIP_DEFLATED
     with zipfile.ZipFile(whole) as old, zipfile.ZipFile(path, "w", method) as new:
         chosen = dice.choice(
-            [name for name in old.namelist() if not name.endswith((".onnx", ".safetensors"))]
+            [name for name in old.namelist() if not name.endswith((".onnx", ".safetensors", ".patch"))]
         )
         for name in old.namelist():
             data = old.read(name)

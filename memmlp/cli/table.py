@@ -20,6 +20,7 @@ from memmlp.cli.options import (
     together_option,
 )
 from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write
 from memmlp.common.text_formats import join_command
 from memmlp.sweep.definition import BRANCHES
 
@@ -292,7 +293,7 @@ def write(out: Path, text: str) -> None:
     """Write the file of --out and print its path. Raises InputError if the file cannot be written."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text, encoding="utf-8")
+        atomic_write(out, text)
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror or error}") from None
     click.echo(str(out))

@@ -279,8 +279,9 @@ class Lock:
             return None
         try:
             os.write(handle, json.dumps({**current_process(), "since": since}).encode())
-        except OSError:
+        except OSError as error:
             path.unlink(missing_ok=True)
+            error.filename = error.filename or str(path)
             raise
         finally:
             os.close(handle)

@@ -30,6 +30,7 @@ from onnxscript.optimizer import fold_constants
 from torch import Tensor, nn
 
 from memmlp import __version__
+from memmlp.common.files import naming_file
 from memmlp.common.lease import publish, temporary_path
 from memmlp.deploy.opsets import NATIVE, convert_opset
 from memmlp.deploy.parity import disable_sampling
@@ -113,7 +114,8 @@ def export_module(
     onnx.helper.set_model_props(graph, meta)
     unfinished = temporary_path(path)
     try:
-        onnx.save(graph, unfinished)
+        with naming_file(path):
+            onnx.save(graph, unfinished)
         publish(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)

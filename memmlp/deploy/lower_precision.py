@@ -8,6 +8,8 @@ jitter.
 from __future__ import annotations
 
 import logging
+import shutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from torch import Tensor
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write
+from memmlp.common.files import atomic_write, naming_file
 from memmlp.common.lease import publish, temporary_path
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
@@ -122,19 +124,20 @@ def _quantise_to_int8(source: Path, path: Path, inner: list[str], clips: Sequenc
     level = root.level
     root.setLevel(logging.ERROR)  # hide the advice to prepare the graph; torch's exporter did it already
     try:
-        quantize_static(
-            source,
-            unfinished,
-            ActivationSamples(source, clips),
-            quant_format=QuantFormat.QDQ,
-            nodes_to_quantize=inner,
-            op_types_to_quantize=["Gemm", "MatMul"],
-            per_channel=True,
-            reduce_range=True,  # seven bits
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-            extra_options={"OpTypesToExcludeOutputQuantization": ["Gemm", "MatMul"]},
-        )
+        with naming_file(path), tempfile.TemporaryDirectory() as folder:
+            quantize_static(
+                shutil.copy(source, folder),  # it writes another file beside its source
+                unfinished,
+                ActivationSamples(source, clips),
+                quant_format=QuantFormat.QDQ,
+                nodes_to_quantize=inner,
+                op_types_to_quantize=["Gemm", "MatMul"],
+                per_channel=True,
+                reduce_range=True,  # seven bits
+                activation_type=QuantType.QUInt8,
+                weight_type=QuantType.QInt8,
+                extra_options={"OpTypesToExcludeOutputQuantization": ["Gemm", "MatMul"]},
+            )
         publish(unfinished, path)
     finally:
         root.setLevel(level)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_file
 from memmlp.evaluation import modes
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, NoIK
@@ -36,11 +37,9 @@ def save_predictions(evaluation: Evaluation, model: MotionModel, test: MotionDat
         for name, clip, motion in zip(test.names, clips, motions, strict=True):
             path = folder / mode / f"{name}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(
-                path,
-                allow_pickle=False,
-                **make_prediction_arrays(model.normalizer, clip, motion, evaluation.ik),
-            )
+            arrays = make_prediction_arrays(model.normalizer, clip, motion, evaluation.ik)
+            with atomic_file(path) as file:
+                np.savez(file, allow_pickle=False, **arrays)
 
 
 def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.ndarray]:

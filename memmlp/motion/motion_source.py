@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -122,5 +123,8 @@ def _generate_once(root: Path, generate: Callable[[Path], object]) -> None:
     with Lock(root.parent, root.name).hold():
         if not root.exists():  # another process may have generated it meanwhile
             unfinished = temporary_path(root)
-            generate(unfinished)
-            publish(unfinished, root)
+            try:
+                generate(unfinished)
+                publish(unfinished, root)
+            finally:
+                shutil.rmtree(unfinished, ignore_errors=True)

@@ -7,6 +7,7 @@ matches the digests in its files.
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 import re
@@ -96,6 +97,10 @@ def import_run(
             run, new = _move_to_runs(archive, path, run_id, outputs)
     except InputError:
         raise
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a position outside the file
+            raise
+        raise InputError(f"{path}: must be an archive of a run ({error.strerror})") from None
     except (zipfile.BadZipFile, zlib.error, struct.error, RuntimeError, EOFError, ValueError) as error:
         raise InputError(f"{path}: must be an archive of a run ({error})") from None
     missing = (name for name in names if "/" in name and not (run.folder / name).exists())

@@ -17,7 +17,7 @@ import numpy as np
 
 from memmlp import __version__
 from memmlp.common.errors import InputError
-from memmlp.common.files import file_digest, now, read_json
+from memmlp.common.files import file_digest, naming_file, now, read_json
 from memmlp.common.lease import publish, temporary_path
 from memmlp.common.npm import ONNXRUNTIME_WEB, read_package_files
 from memmlp.common.page_server import build_security_policy, read_page_file
@@ -144,7 +144,8 @@ class Site:
         unfinished = temporary_path(out)
         try:
             unfinished.mkdir(parents=True)
-            self._write_contents(unfinished)
+            with naming_file(out):
+                self._write_contents(unfinished)
             total = sum(path.stat().st_size for path in _list_files(unfinished))
             earlier = temporary_path(out)
             if out.exists():

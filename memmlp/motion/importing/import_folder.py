@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import RECORD, describe_body, load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, SkippedFile
@@ -259,7 +260,7 @@ def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, 
     may have clips of two imports.
     """
     record = {**body, **asdict(report)}
-    (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    atomic_write(staging / RECORD, json.dumps(record, indent=1) + "\n")
     if not out.exists():
         staging.rename(out)
         return

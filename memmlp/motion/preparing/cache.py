@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, is_disk_error
 from memmlp.common.lease import Lock, check_owner, publish, temporary_path
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FRAME_DIM, check_imported_body, format_body_name, load_rest_joints
@@ -62,6 +62,7 @@ def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
     Raises:
         InputError: if the root has no usable clips, the split is impossible, the folder cannot be written, or
             a file is bad and `strict` is set.
+        OSError: if the disk is full or read-only.
     """
     source = replace(source, body=str(source.body))
     if source.min_frames < 2:
@@ -82,6 +83,9 @@ def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
             _write_cache(source, rest, manifest, out)
             return manifest
     except OSError as error:
+        if is_disk_error(error):
+            error.filename = error.filename or str(out)
+            raise
         raise InputError(f"{out}: the cache cannot be written ({error.strerror or error})") from error
 
 

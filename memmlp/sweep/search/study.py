@@ -25,7 +25,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write
+from memmlp.common.files import atomic_write, naming_file
 from memmlp.common.lease import check_owner
 from memmlp.sweep.search.search_file import Range, Search, Value
 
@@ -162,7 +162,7 @@ class FencedJournal(JournalFileBackend):
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
         """Append lines to the journal. Raises LeaseLost if another process now owns its folder."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
-        with open(self.path, "ab") as file:
+        with naming_file(Path(self.path)), open(self.path, "ab") as file:
             check_owner(
                 self.path
             )  # after opening, because `repair_journal` of a later owner replaces the file
