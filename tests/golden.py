@@ -26,8 +26,8 @@ from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
-from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
+from memmlp.evaluation.modes import Evaluation
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MirroredDataset, WindowSampler

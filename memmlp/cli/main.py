@@ -38,7 +38,7 @@ COMMANDS = {
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the validation errors.", True),
     "table": Command("table", "table", "Show the paper's tables beside measured numbers."),
     "results": Command("results", "results", "Keep results of runs with the code; make pages from them."),
-    "report": Command("report", "report", "Write the page of `memmlp ui` as one HTML file."),
+    "report": Command("ui", "report", "Write the page of `memmlp ui` as one HTML file."),
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
     "loggers": Command("loggers", "loggers", "Add runs to MLflow, TensorBoard or W&B."),
     "mlflow": Command("loggers", "mlflow", "Open MLflow's page of the runs."),

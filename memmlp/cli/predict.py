@@ -20,7 +20,7 @@ from memmlp.cli.options import (
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
-    from memmlp.evaluation.evaluation import Evaluation
+    from memmlp.evaluation.modes import Evaluation
     from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.exporting import ExportReport
 

@@ -1,16 +1,24 @@
-"""`memmlp ui`: a local web page of runs, sweeps and searches."""
+"""The page of all runs: `memmlp ui` serves it, `memmlp report` writes it as one file."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import add_page_options, host_option, outputs_option, plugins_option, token_option
+from memmlp.cli.options import (
+    HomePath,
+    add_page_options,
+    host_option,
+    outputs_option,
+    plugins_option,
+    token_option,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,3 +72,36 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
     opened = OpenedRun(run, experiment, load_run_data(run, experiment))
     with torch.inference_mode():
         return predict_clip(opened.network(), find_clip(opened.test, clip, "clip"), mode)
+
+
+@click.command("report")
+@click.argument("sweeps", nargs=-1)
+@click.option(
+    "--out",
+    type=HomePath(dir_okay=False),
+    help="HTML file to write.  [default: report.html in --outputs]",
+)
+@click.option("--no-replays", is_flag=True, help="Write a smaller file, without 3D replays of clips.")
+@plugins_option
+@outputs_option
+def report(sweeps: tuple[str, ...], out: Path | None, no_replays: bool, outputs: Path) -> None:
+    """Write the page of `memmlp ui` as one file, which works offline.
+
+    SWEEPS are sweep files, numbers of the paper's tables, or folders in outputs/sweeps. The default is all
+    sweeps. The file contains the runs and tables of these sweeps, and all searches.
+    """
+    from memmlp.cli.table import write
+    from memmlp.report.ui.report_file import write_page
+    from memmlp.report.ui.server import Answers
+    from memmlp.runs.environment import describe_environment
+
+    facts = describe_environment()
+    git = facts["git"] or {}
+    code = f"{git.get('commit', facts['version'])[:7]}{' with changes' if git.get('dirty') else ''}"
+    about = datetime.now(UTC).strftime(f"Generated %Y-%m-%d %H:%M UTC, code {code}")
+    answers = Answers(outputs, predict)
+    try:
+        text = write_page(answers, sweeps, about, not no_replays)
+    finally:
+        answers.close()
+    write(out or outputs / "report.html", text)

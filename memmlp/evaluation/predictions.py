@@ -14,8 +14,8 @@ from torch import Tensor
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_file
 from memmlp.evaluation import modes
-from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, NoIK
+from memmlp.evaluation.modes import Evaluation
 from memmlp.motion.body import FPS, SPARSE_DIM
 from memmlp.motion.clip import SPLINES, Clip, resample
 from memmlp.motion.dataset import MotionDataset

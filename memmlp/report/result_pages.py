@@ -9,8 +9,7 @@ from typing import NamedTuple
 from memmlp.common.errors import InputError, import_optional
 from memmlp.common.text_formats import escape_markdown
 from memmlp.report.kept_results import KeptResults
-from memmlp.report.pictures.frontier_picture import draw_frontiers
-from memmlp.report.tables.frontier import COST_HEADINGS, has_frontier
+from memmlp.report.pictures.frontier import COST_HEADINGS, draw_frontiers, has_frontier
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Cell, Row, Table

@@ -22,7 +22,7 @@ from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_dis
 from memmlp.common.files import write_json
 from memmlp.common.progress import announce, notify
 from memmlp.deploy.deployment import Deployment
-from memmlp.evaluation.evaluation import Evaluation, predict_first_clip
+from memmlp.evaluation.modes import Evaluation, predict_first_clip
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.live.pose_latency import measure_pose_times
 from memmlp.motion.dataset import MotionDataset

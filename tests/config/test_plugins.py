@@ -142,10 +142,9 @@ def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
 def test_a_metric_is_measured_in_both_branches(on_path: Path):
     from tiny import frames, model
 
-    from memmlp.evaluation.evaluation import Evaluation
     from memmlp.evaluation.ik import NoIK
     from memmlp.evaluation.metrics import UserMetric
-    from memmlp.evaluation.modes import measure_stream
+    from memmlp.evaluation.modes import Evaluation, measure_stream
 
     def mean(predicted: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         return predicted.mean()
@@ -245,7 +244,10 @@ def test_an_executor_of_ones_own(folder: Path):
 def recorded(config: dict, version: str | None = None) -> Run:
     """What a finished run tells, as far as `load_config` asks."""
     manifest = {"kind": "memmlp", "plugins": {PACKAGE: {"version": version, "digest": "d"}}}
-    return SimpleNamespace(id="abc", done=True, manifest=manifest, config=config, config_path="c")  # type: ignore[return-value]
+    folder = Path("outputs/runs/abc")
+    return SimpleNamespace(
+        id="abc", done=True, manifest=manifest, config=config, config_path="c", folder=folder
+    )  # type: ignore[return-value]
 
 
 def test_reading_a_run_imports_nothing_by_itself(on_path: Path, monkeypatch: pytest.MonkeyPatch):

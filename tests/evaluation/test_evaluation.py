@@ -6,9 +6,8 @@ import pytest
 import tiny
 import torch
 
-from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
-from memmlp.evaluation.modes import average_clips, measure_clip, measure_stream
+from memmlp.evaluation.modes import Evaluation, average_clips, measure_clip, measure_stream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
 

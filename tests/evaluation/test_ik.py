@@ -5,9 +5,8 @@ import tiny
 import torch
 from torch import Tensor
 
-from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import LBFGS, Arms, JointDistance, NoIK
-from memmlp.evaluation.modes import extract_rotations, measure_clip, predict_stream
+from memmlp.evaluation.modes import Evaluation, extract_rotations, measure_clip, predict_stream
 from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
 from memmlp.motion.network_coordinates import Heading

@@ -9,9 +9,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from memmlp.evaluation import metrics
-from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
-from memmlp.evaluation.modes import predict_stream, predict_windows
+from memmlp.evaluation.modes import Evaluation, predict_stream, predict_windows
 from memmlp.motion.body import MOTION_DIM
 
 

@@ -9,10 +9,8 @@ from tiny import REST, baseline, model
 from tiny import frames as tiny_frames
 
 from memmlp.common.errors import InputError
-from memmlp.evaluation import evaluation
-from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import LBFGS, NoIK
-from memmlp.evaluation.modes import predict_stream
+from memmlp.evaluation.modes import Evaluation, predict_first_clip, predict_stream
 from memmlp.evaluation.predictions import (
     ClipPredictor,
     make_clip,
@@ -126,5 +124,5 @@ def test_an_offline_network_has_no_stream_to_predict_or_to_draw(tmp_path: Path):
     with pytest.raises(InputError, match="mode=stream"):
         ClipPredictor(offline, "stream", "rotation", Evaluation(["window"], 2, NoIK(), 0))
     assert predict_clip(offline, frames(source(30)), "window")["predicted_positions"].shape == (29, 22, 3)
-    truth, predicted = evaluation.predict_first_clip(offline, tiny_frames())
+    truth, predicted = predict_first_clip(offline, tiny_frames())
     assert truth.shape == predicted.shape

@@ -8,8 +8,8 @@ import torch
 
 from memmlp.common.errors import InputError
 from memmlp.evaluation import modes
-from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
+from memmlp.evaluation.modes import Evaluation
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks import diffusion as ancestral
 from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph

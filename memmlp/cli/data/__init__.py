@@ -60,8 +60,8 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
     """
     from memmlp.common.files import atomic_write
     from memmlp.report.pictures.clip_pictures import check_picture_path
-    from memmlp.report.pictures.clip_sheet import draw_sheet, read_sample
     from memmlp.report.pictures.drawing import encode_png
+    from memmlp.report.pictures.import_pictures import draw_sheet, read_sample
 
     check_picture_path(out, "--out", (".png",))
     shown, skipped, total = read_sample(source, clips, body)

@@ -192,7 +192,7 @@ def show(file: Path, skeleton: str | None, out: Path) -> None:
     from memmlp.motion.importing.recordings import read_recording
     from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
     from memmlp.report.pictures.clip_pictures import check_picture_path
-    from memmlp.report.pictures.skeleton_picture import write_skeleton_picture
+    from memmlp.report.pictures.import_pictures import write_skeleton_picture
 
     check_picture_path(out, "--out", (".png",))
     recording = read_recording(file)

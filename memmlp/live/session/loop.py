@@ -24,9 +24,8 @@ from memmlp.live.spaces import SPACES, SpaceName
 from memmlp.live.stream import FORGOTTEN, BodyFrame, Stream, move_up
 from memmlp.live.tracker_input import OddSamples
 from memmlp.live.wearer import Calibration, save_calibration
-from memmlp.motion.body import FPS, JOINTS, PARENTS, ROOT
+from memmlp.motion.body import FPS, HEAT, JOINTS, LIMBS, PARENTS, ROOT
 from memmlp.motion.formats.gltf import VRM_BONES
-from memmlp.motion.limb_shapes import HEAT, LIMBS
 
 PAGE_SPACE = SPACES["openxr"]  # three.js uses the same axes
 TOP = 20  # maximum of the page's colour scale, cm

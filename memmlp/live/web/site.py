@@ -28,8 +28,7 @@ from memmlp.live.session.sources import TrackedClip
 from memmlp.live.spaces import SPACES
 from memmlp.live.trackers_to_body_graph import export_full
 from memmlp.live.wearer import compute_body_height
-from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED
-from memmlp.motion.limb_shapes import HEAT, LIMBS
+from memmlp.motion.body import FPS, HEAT, JOINTS, LIMBS, PARENTS, TRACKED
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 

@@ -19,9 +19,8 @@ from scipy.spatial.transform import Rotation
 
 import memmlp
 from memmlp.common.files import atomic_file
-from memmlp.motion.body import HEAD, JOINTS, N_JOINTS, PARENTS
+from memmlp.motion.body import HEAD, JOINTS, LIMBS, N_JOINTS, PARENTS, find_limb_ends
 from memmlp.motion.clip import Clip, convert_to_y_up
-from memmlp.motion.limb_shapes import LIMBS, find_limb_ends
 
 COMPONENTS = {"<f4": 5126, "<u2": 5123, "|u1": 5121}  # glTF's codes for component types
 VERTICES, INDICES = 34962, 34963  # glTF's codes for buffer view targets

@@ -15,13 +15,14 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Clip, SkippedFile, resample
 from memmlp.motion.formats.npz import NoMotionError, read_clip
 from memmlp.motion.plausibility import check_plausible
-from memmlp.motion.preparing.conversions import find_conversions, mark_turns
 from memmlp.motion.preparing.duplicates import (
     MarkedFrames,
     compute_first_frames,
+    find_conversions,
     find_resampled_copies,
     find_shared_stretches,
     mark_frames,
+    mark_turns,
     merge_contents,
 )
 from memmlp.motion.preparing.find_clips import Root, find_clips, get_clip_name

@@ -15,8 +15,7 @@ import numpy as np
 from memmlp.common.errors import InputError, import_optional
 from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
-from memmlp.motion.body import FPS, ROOT
-from memmlp.motion.limb_shapes import LIMBS, RADII
+from memmlp.motion.body import FPS, LIMBS, RADII, ROOT
 from memmlp.report.pictures.drawing import (
     ELEVATION,
     NEUTRAL,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from memmlp.motion.limb_shapes import HEAT, LIMBS, find_limb_ends
+from memmlp.motion.body import HEAT, LIMBS, find_limb_ends
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

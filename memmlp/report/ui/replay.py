@@ -12,8 +12,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.live.spaces import SPACES
-from memmlp.motion.body import FPS, JOINTS
-from memmlp.motion.limb_shapes import HEAT, LIMBS
+from memmlp.motion.body import FPS, HEAT, JOINTS, LIMBS
 from memmlp.report.pictures.clip_pictures import find_colour_scale_top
 from memmlp.runs.run import Run
 

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.report.ui.page_files import make_single_file
 from memmlp.report.ui.runs import read_curves, thin_out
-from memmlp.report.ui.server import Answers
+from memmlp.report.ui.server import Answers, make_single_file
 from memmlp.report.ui.sweeps import KnownSweep
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES

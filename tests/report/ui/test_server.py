@@ -13,8 +13,7 @@ from processes import until
 from report.ui.conftest import predict, run_of, started_run
 
 from memmlp.common.errors import InputError
-from memmlp.report.ui import page_files
-from memmlp.report.ui.server import Answers, RunsServer
+from memmlp.report.ui.server import FILES, Answers, RunsServer
 
 TOKEN = "a token of many letters"
 
@@ -99,7 +98,7 @@ def test_bad_questions_and_bugs_are_answers(server: RunsServer, outputs: Path, m
 
 
 def test_the_page_s_files_and_their_policy(server: RunsServer, outputs: Path):
-    for name in page_files.FILES:
+    for name in FILES:
         answer = get(server, f"/{name}")
         assert (answer.code, len(answer.body) > 100) == (200, True)
     policy = answer.headers["Content-Security-Policy"]

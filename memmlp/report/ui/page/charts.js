@@ -35,8 +35,9 @@ const base = (width, height, more) => ({
   ...more,
 });
 
-export const colourOf = groups => new Map(groups.map((group, i) => [group, COLOURS[i % COLOURS.length]]));
+export const colourOf = groups => new Map([...groups].map((group, i) => [group, COLOURS[i % COLOURS.length]]));
 
+const nameWidth = names => Math.max(...names.map(name => name.length)) * 6.6 + 18;
 const tip = (data, options) => Plot.tip(data, Plot.pointer({ fill: 'var(--card)', stroke: 'var(--line)', textPadding: 8, ...options }));
 
 // Curves by group with the band of each group's runs.
@@ -102,7 +103,7 @@ export function forest(rows, { label, smallest }) {
   const colour = row => ({ holds: 'var(--good)', opposite: 'var(--bad)' })[row.verdict] ?? 'var(--accent)';
   const shorten = name => (name.length > 34 ? `${name.slice(0, 33)}…` : name);
   const draw = width => Plot.plot(base(width, 64 + 34 * domain.length, {
-    marginLeft: Math.min(6.6 * Math.max(...domain.map(name => name.length)) + 18, 230, width * 0.38), marginBottom: 38,
+    marginLeft: Math.min(nameWidth(domain), 230, width * 0.38), marginBottom: 38,
     x: { label: `${label}, difference`, grid: true, zero: true, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none' },
     y: { domain, label: null, tickSize: 0, tickFormat: shorten },
     marks: [

@@ -1,14 +1,32 @@
 """Sheets of clips: which clips, how many panels, and what is refused."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
+import numpy as np
 import pytest
+from bvh_samples import write
+from PIL import Image
+from skeleton_families import walking
 
 from memmlp.common.errors import InputError
+from memmlp.motion.body import make_builtin_rest_joints
+from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.importing.convert import view_stance
+from memmlp.motion.importing.skeleton_map import find_skeleton
 from memmlp.motion.synthetic import synthesize_clip
-from memmlp.report.pictures.clip_sheet import ACROSS, draw_sheet, read_sample
 from memmlp.report.pictures.drawing import get_pixels
+from memmlp.report.pictures.import_pictures import (
+    ACROSS,
+    LEFT,
+    MIDDLE,
+    RIGHT,
+    draw_sheet,
+    read_sample,
+    write_skeleton_picture,
+)
 
 
 @pytest.fixture
@@ -46,3 +64,20 @@ def test_a_sheet_has_a_row_for_every_few_clips(folder: Path):
     panels = sheet[height // 2 + 30 :].reshape(-1, 3 * ACROSS, width // (3 * ACROSS), 3)
     blank = [(panels[:, number] == 255).all() for number in range(3 * ACROSS)]
     assert blank == [False] * 3 + [True] * 9  # the fifth clip has three panels in the second row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("far", [False, True])
+def test_sides_are_on_their_sides(tmp_path: Path, far: bool):
+    bvh = read_bvh(write(tmp_path, walking("mixamo").text()))
+    stance = view_stance(bvh, find_skeleton(bvh), make_builtin_rest_joints())
+    if far:
+        stance.positions[stance.nodes.index("HeadTop_End")] += [50.0, 0.0, 50.0]
+    write_skeleton_picture(tmp_path / "out.png", stance, "a file")
+    picture = np.asarray(Image.open(tmp_path / "out.png").convert("RGB"))
+    width = picture.shape[1] // 5
+    front, body = picture[:, width : 2 * width], picture[60:-60, 3 * width :]
+    colours = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in (RIGHT, LEFT, MIDDLE)]
+    right, left, middle = (np.median(np.nonzero((front == rgb).all(-1))[1]) for rgb in colours)
+    assert right + 5 < middle < left - 5
+    assert 0.05 < (body.max(-1) < 200).mean() < 0.5

@@ -10,9 +10,8 @@ import pytest
 from fake_runs import fake_run, table_of
 
 from memmlp.report.kept_results import KeptResults
-from memmlp.report.pictures.frontier_picture import draw_frontiers
+from memmlp.report.pictures.frontier import draw_frontiers, has_frontier, list_points
 from memmlp.report.result_pages import KeptTable, draw_pictures, make_pages
-from memmlp.report.tables.frontier import has_frontier, list_points
 from memmlp.report.tables.table import Table
 from memmlp.sweep.sweep_file import parse_sweep
 
