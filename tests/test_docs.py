@@ -196,7 +196,9 @@ def compose_sweep(values: dict[str, Any]) -> None:
 def compose_search(overrides: Sequence[str]) -> None:
     words = split_executor(overrides)[2]
     own = [word for word in words if word.lstrip("+~").startswith("search")]
-    search = parse_search(compose_plain("tune", own)["search"])
+    content = compose_plain("tune", own)["search"]
+    best = {"optim.lr": 0.004, "optim.weight_decay": 0.01}  # in place of the earlier search of search.after
+    search = parse_search(content, best if content["after"] else None)
     rest = [word for word in words if word not in own]
     compose_once([*search.base, *rest, *search.overrides(next(iter(search.list_first_trials()), {}))])
 
