@@ -47,10 +47,11 @@ def export_run(run: Run, out: Path) -> str:
     The checkpoint is left out, since a finished run is never resumed.
 
     Raises:
-        InputError: if the run is not finished, or if files are missing or have changed.
+        InputError: if the run is not finished, or if files are missing, damaged or have changed.
     """
     if not run.done:
         raise InputError(f"run {run.id}: must be finished; its status is {run.status}")
+    run.check_records()
     if changed := run.verify():
         raise InputError(f"run {run.id}: must be unchanged; missing or changed files: {', '.join(changed)}")
     run_files = [path for pattern in run.FILES for path in sorted(run.folder.glob(pattern))]

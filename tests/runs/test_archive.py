@@ -91,6 +91,11 @@ def test_what_a_run_lacks_that_is_there_already_is_named(run: Run, archive: Path
 
 
 def test_only_a_finished_and_unchanged_run_leaves(run: Run, tmp_path: Path):
+    config = run.config_path.read_bytes()
+    run.config_path.write_text("export:")
+    with pytest.raises(InputError, match=r"config\.yaml: cannot be read .export must be a mapping"):
+        export_run(run, tmp_path / "x.zip")
+    run.config_path.write_bytes(config)
     run.model.write_bytes(b"other")
     with pytest.raises(InputError, match=r"missing or changed files: model\.safetensors"):
         export_run(run, tmp_path / "x.zip")
