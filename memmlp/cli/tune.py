@@ -15,7 +15,7 @@ from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
 from memmlp.common.overrides import Override
-from memmlp.common.text_formats import join_command
+from memmlp.common.text_formats import escape_interpolations, join_command
 
 if TYPE_CHECKING:
     from memmlp.sweep.plan import RunTask
@@ -212,7 +212,7 @@ def _make_requests(setup: SearchSetup, values: Mapping[str, Value]) -> list[RunR
     from memmlp.config.compose import compose_config
 
     cfg = compose_config([*setup.config_options, *setup.list_overrides(values)])
-    cfg.paths.outputs = str(setup.outputs)
+    cfg.paths.outputs = escape_interpolations(str(setup.outputs))
     first, found = cfg.seed, []
     for number in range(setup.search.seeds):
         cfg.seed = first + number

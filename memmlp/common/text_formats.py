@@ -13,7 +13,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -52,8 +52,17 @@ def make_override(key: str, text: str) -> str:
     """Return the override KEY=TEXT in Hydra's grammar; a text that is not a plain word is quoted."""
     if PLAIN_OVERRIDE.fullmatch(text):
         return f"{key}={text}"
-    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)  # for OmegaConf
+    text = escape_interpolations(text)
     return f"{key}='" + re.sub(r"(\\*)('|\Z)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), text) + "'"
+
+
+def escape_interpolations(value: Any) -> Any:
+    """Return texts, or a config with texts, such that OmegaConf reads ${NAME} as it is written."""
+    if isinstance(value, Mapping):
+        return {key: escape_interpolations(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [escape_interpolations(item) for item in value]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
 
 
 def expand_home(override: str) -> str:

@@ -26,6 +26,7 @@ from memmlp.common.components import (
 )
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import format_value
+from memmlp.common.text_formats import escape_interpolations
 from memmlp.config import plugins
 from memmlp.config.build_request import build_request, read_source_weights
 from memmlp.config.check import check
@@ -292,20 +293,22 @@ def _use_outputs(cfg: DictConfig, outputs: Path) -> None:
 
     Recorded motion below the recorded outputs is expected at the same place below `outputs`, if it is there.
     """
-    recorded, cfg.paths.outputs = cfg.paths.outputs, str(outputs)
+    recorded, cfg.paths.outputs = cfg.paths.outputs, escape_interpolations(str(outputs))
     cfg.force, cfg.save_predictions, cfg.loggers = False, None, {}
 
     def move(path: Any) -> str | None:
         path = Path(str(path))
         if not path.is_relative_to(recorded) or ".." in path.parts:
             return None
-        return str(outputs / path.relative_to(recorded))
+        return escape_interpolations(str(outputs / path.relative_to(recorded)))
 
     if cfg.data.synth is not None:
-        cfg.data.root = move(cfg.data.root) or str(outputs / "data" / "synth")
+        cfg.data.root = move(cfg.data.root) or escape_interpolations(str(outputs / "data" / "synth"))
     for data in (cfg.data, *(cfg.data.get("sources") or {}).values()):
-        if (moved := move(data.root)) and Path(moved).exists():
+        before = data.root
+        if moved := move(before):
             data.root = moved
+            data.root = moved if Path(data.root).exists() else escape_interpolations(before)
 
 
 def _apply_override(cfg: DictConfig, word: str) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest
 from memmlp.common.overrides import Override
+from memmlp.common.text_formats import escape_interpolations
 from memmlp.config.plugins import activate, find_named_packages, find_packaged_folder
 from memmlp.sweep.definition import Sweep, Variant, parse_key, save_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
@@ -144,7 +145,7 @@ def _build_requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[t
         cfg = compose_config(list(sweep.merge_overrides(variant)))
         if cfg.force:  # variants may share a run, which would be trained repeatedly
             raise InputError("force=true: expected --again, which trains a sweep's finished runs again")
-        cfg.paths.outputs = str(outputs)
+        cfg.paths.outputs = escape_interpolations(str(outputs))
         yield from zip(seeds, build_requests(cfg, seeds), strict=True)
     except InputError as error:
         raise InputError(f"sweep {sweep.name}, variant '{variant.label}': {error}") from None

@@ -27,6 +27,7 @@ from memmlp.common.settings import (
     text,
     within,
 )
+from memmlp.common.text_formats import escape_interpolations
 from memmlp.runs.deployment_folder import ONNX_FILES
 
 
@@ -326,7 +327,7 @@ def restore_config(config: Mapping[str, Any]) -> DictConfig:
             schema.
     """
     cfg = OmegaConf.structured(Config)
-    for key, content in config.items():
+    for key, content in escape_interpolations(config).items():
         if not isinstance(content, Mapping):
             cfg[key] = content
         elif key == "loggers":

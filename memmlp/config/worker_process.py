@@ -59,6 +59,7 @@ def perform_task(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     """
     from omegaconf import OmegaConf
 
+    from memmlp.common.text_formats import escape_interpolations
     from memmlp.config.build import build_experiment
     from memmlp.config.plugins import activate
     from memmlp.runs.identity import NETWORK
@@ -66,7 +67,7 @@ def perform_task(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     from memmlp.training.run_stages import make_prerequisites, run_experiment
 
     activate(task.config.get("plugins") or ())
-    experiment = build_experiment(OmegaConf.create(dict(task.config)))
+    experiment = build_experiment(OmegaConf.create(escape_interpolations(task.config)))
     check_identity(experiment, task)
     use_threads(experiment.config["threads"] or threads)
     if task.kind != NETWORK:

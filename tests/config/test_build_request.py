@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -146,3 +147,9 @@ def test_another_version_of_a_generator_makes_other_motion(monkeypatch: pytest.M
     newer = replace(find_component("generator", "puppet"), version=7)
     monkeypatch.setitem(collect_components(), ("generator", "puppet"), newer)
     assert build_motion(compose_config(["profile=tiny"])).clips.root == before.with_name(f"{before.name}-v7")
+
+
+def test_recorded_texts_are_not_interpolations():
+    record: Any = OmegaConf.to_container(mix(), resolve=True)
+    record["paths"]["outputs"] = "a/${seed}/\\${oc.env:HOME}"
+    assert restore_config(record).paths.outputs == record["paths"]["outputs"]

@@ -16,6 +16,7 @@ from memmlp.cli.data.printing import (
 )
 from memmlp.cli.options import PATH, FiniteFloat, body_option, format_option, strict_option
 from memmlp.common.errors import InputError
+from memmlp.common.text_formats import escape_interpolations
 
 
 @click.group("data")
@@ -88,7 +89,7 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
 
     has_protocol = any(override.startswith("data=") for override in overrides)
     cfg = compose_config([*([] if has_protocol else ["data=mocap"]), *overrides, "data.root=."])
-    OmegaConf.update(cfg, "data.root", str(root))
+    OmegaConf.update(cfg, "data.root", escape_interpolations(str(root)))
     show_manifest(prepare_cache(build_motion(cfg).clips, out))
 
 

@@ -111,7 +111,8 @@ class ShownInWandB:
         """Write results to the summary and upload files, then set the final status."""
         self.run.summary.update({point.key: point.value for point in facts.results} | facts.texts)
         for path in facts.files:
-            self.run.save(glob.escape(str(path)), base_path=str(facts.folder), policy="now")
+            literal = {"glob": False} if glob.escape(str(path)) != str(path) else {}  # new in wandb
+            self.run.save(str(path), base_path=str(facts.folder), policy="now", **literal)
         self.run.finish(exit_code=0 if facts.status == "done" else 1)
         (self.folder / FINGERPRINT).write_text(facts.fingerprint)
 

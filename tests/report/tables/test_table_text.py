@@ -7,8 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 from fake_runs import CLIPS, fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
+from markdown_it import MarkdownIt
 
 from memmlp.report.tables.table import Cell, Effect, Table
 from memmlp.report.tables.table_text import FORMATS, MINUS, format_effect, format_value, make_legend
@@ -141,3 +143,32 @@ def test_json_has_the_values_of_each_seed(table: Table):
     assert found["values"] == {str(seed): value for seed, value in expected.values.items()}
     assert found["effect"]["holm"] == expected.effect.holm
     assert (found["agrees"], found["paper"], content["rows"][0]["wanted"]) == (False, 3.0, [])
+
+
+def test_every_format_keeps_any_label(tmp_path: Path):
+    labels = [
+        "off",
+        "010",
+        "[2]",
+        "*",
+        "-x",
+        "a|b",
+        "[red]:bug:",
+        "$x$ & 5 %",
+        "~/é😀",
+        "a--b",
+        "&amp;",
+        "</script>",
+    ]
+    path = tmp_path / "any.yaml"
+    path.write_text(
+        yaml.safe_dump({"variants": {label: [] for label in labels}}, allow_unicode=True, sort_keys=False)
+    )
+    sweep = load_sweep(path)
+    table = table_of(sweep, fake_sweep(tmp_path, sweep))
+    assert [row.label for row in table.rows] == labels
+    tokens = MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(FORMATS["md"](table))
+    shown = {"".join(child.content for child in token.children or ()) for token in tokens}
+    assert {*labels} <= shown
+    assert all(label.split()[0][:8] in printed(table, 200) for label in labels)
+    assert not re.search(r"^[\[*(]", FORMATS["tex"](table), re.MULTILINE)

@@ -95,3 +95,12 @@ def test_a_failed_run_with_its_curve_name_and_tags_once(tmp_path: Path):
     (end,) = [record.exit for record in found if record.WhichOneof("record_type") == "exit"]
     assert end.exit_code == 1
     assert summary(found)["outdated results"].startswith("stream (mode.stream 0 -> ")
+
+
+def test_a_folder_that_looks_like_a_pattern(tmp_path: Path):
+    folder = tmp_path / "run [1] *"
+    run, logger = a_run(folder), WandB("memmlp", folder)
+    run.finish([])
+    assert sync_runs(logger, [run], print) == {"shown": 1}
+    saved = Path(logger.place).glob(f"offline-run-*-{run.id}/files/config.yaml")
+    assert [path.read_bytes() for path in saved] == [run.config_path.read_bytes()]
