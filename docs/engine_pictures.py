@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT, find_joint_colour
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.files import atomic_write
@@ -19,6 +18,7 @@ from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES, Space
 from memmlp.motion.body import JOINTS, PARENTS, RADII, TRACKED, make_builtin_rest_joints
 from memmlp.report.pictures.drawing import Camera, draw_skeleton, encode_png, freeze_layout, make_panels
+from memmlp.report.pictures.import_pictures import LEFT, MIDDLE, RIGHT, find_joint_colour
 
 IMAGES = Path(__file__).parent / "images"
 COLOURS = ("#d1242f", "#1a7f37", "#0969da")  # of X, Y and Z

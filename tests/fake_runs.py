@@ -123,7 +123,8 @@ def digest_json(content: Mapping[str, Any]) -> str:
 
 def write_evaluation(path: Path, report: Mapping[str, Any]) -> None:
     """Write an evaluation file with a new digest."""
-    content = {key: value for key, value in report.items() if key != "digest"}
+    text = json.dumps({key: value for key, value in report.items() if key != "digest"})
+    content = json.loads(text, parse_constant=lambda name: name.replace("Infinity", "inf").lower())
     path.write_text(json.dumps(content | {"digest": digest_json(content)}))
 
 
