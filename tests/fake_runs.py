@@ -64,7 +64,7 @@ def fake_run(
         deployment.latency: latency | {"made": "2026"},
     }
     for path, content in files.items():
-        path.write_text(json.dumps(content))
+        path.write_text(json.dumps(name_infinities(content)))
     of_clips = tuple((clip, groups[clip] if groups else None) for clip in clips)
     about = {"settings": {}, "made_by": manifest, "made": "2026"} | (evaluated or {})
     words = json.dumps(about)[1:]
@@ -121,10 +121,16 @@ def digest_json(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def name_infinities(content: Mapping[str, Any]) -> Any:
+    """Content with "nan" and "inf" for numbers that JSON does not have, as the project stores them."""
+    return json.loads(
+        json.dumps(content), parse_constant=lambda name: name.replace("Infinity", "inf").lower()
+    )
+
+
 def write_evaluation(path: Path, report: Mapping[str, Any]) -> None:
     """Write an evaluation file with a new digest."""
-    text = json.dumps({key: value for key, value in report.items() if key != "digest"})
-    content = json.loads(text, parse_constant=lambda name: name.replace("Infinity", "inf").lower())
+    content = name_infinities({key: value for key, value in report.items() if key != "digest"})
     path.write_text(json.dumps(content | {"digest": digest_json(content)}))
 
 
