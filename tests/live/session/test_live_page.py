@@ -98,7 +98,6 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser, clip,
         if worn:
             said = browser.value("document.querySelector('#remark').textContent")
             assert said == "This network is hardly trained."
-        browser.wait("document.querySelector('#trackers').classList.contains('waiting')")
         server.hub.publish({"dropped": 0, "malformed": 3})
         browser.wait("document.querySelector('#status').textContent.endsWith('3 packets malformed')")
     browser.wait("document.querySelector('#status').textContent == 'not connected'")

@@ -19,6 +19,7 @@ const viewer = new Viewer([
   ['frames', 'frames', '', frame => frame.number + 1],
   ['dropped', 'dropped', '', frame => frame.dropped],
   ['malformed', 'malformed', '', frame => frame.malformed],
+  ['held', 'lost and held', '', frame => frame.held.join(', ') || null],
   ['jumping', 'times jump', '', frame => (frame.jumping ? 'in seconds?' : null)],
 ], { refresh: showState });
 document.querySelector('main').prepend(viewer.element);
@@ -52,7 +53,8 @@ function greet(message) {
 async function loadAvatar(description) {
   try {
     const { Avatar } = await import('./avatar.js');
-    viewer.stage.addAvatar(await Avatar.load('avatar.vrm', description));
+    viewer.stage.avatar = await Avatar.load('avatar.vrm', description); // in place of the limbs
+    viewer.stage.scene.add(viewer.stage.avatar.scene);
     document.documentElement.dataset.avatar = 'loaded';
   } catch (error) {
     viewer.element.append(h('p', { class: 'warning' }, `The avatar cannot be shown (${error.message}).`));
@@ -68,10 +70,7 @@ function describeState() {
   return viewer.paused ? ['', 'paused'] : ['live', 'live'];
 }
 
-function showState(frame) {
+function showState() {
   const [kind, line] = describeState();
-  $('status').className = kind;
-  $('status').textContent = line;
-  $('trackers').classList.toggle('waiting', kind !== 'live' && !viewer.paused);
-  for (const item of $('trackers').children) item.classList.toggle('held', Boolean(frame?.held.includes(item.dataset.name)));
+  Object.assign($('status'), { className: kind, textContent: line });
 }

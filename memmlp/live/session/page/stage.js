@@ -54,12 +54,6 @@ export class Stage {
     this.grey = colour('--truth');
   }
 
-  // Show a VRM avatar in place of the round limbs.
-  addAvatar(avatar) {
-    this.avatar = avatar;
-    this.scene.add(avatar.scene);
-  }
-
   show(frame) {
     const { positions, truth, errors } = frame;
     this.prediction.group.visible = !this.avatar;

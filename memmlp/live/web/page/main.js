@@ -40,10 +40,6 @@ function show(site, home) {
 async function keepOffline() {
   const status = document.getElementById('status');
   try {
-    const updated = navigator.serviceWorker.controller !== null;
-    navigator.serviceWorker.addEventListener('controllerchange', () => {
-      if (updated) replace(status, h('a', { href: '', onclick: () => location.reload() }, 'new version: reload'));
-    });
     await navigator.serviceWorker.register('sw.js');
     await navigator.serviceWorker.ready;
     Object.assign(status, { textContent: 'works offline', className: 'live' });

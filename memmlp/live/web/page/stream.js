@@ -1,9 +1,7 @@
-// A trained network that runs on live trackers. It follows the same rules as memmlp.live.stream.Stream and
-// memmlp.live.tracker_resampling; tests/live/web/test_stream_js.py compares them.
+// A trained network that runs on live trackers, by the rules of memmlp.live.stream.Stream and tracker_resampling.
 //
 // Everything is in OpenXR's frame of reference: metres, Y up, -Z forward; a rotation is a quaternion, the identity for a
-// person in T-pose who looks along -Z. A sample is { time, positions, rotations } of head, left and right wrist. `run` does
-// one frame of the full graph (memmlp.live.trackers_to_body_graph); its caller is a page, a worker or node.
+// person in T-pose who looks along -Z. A sample is { time, positions, rotations } of head, left and right wrist.
 
 import { aboutVertical, headingOf, IDENTITY, inverse, matrix, minus, multiply, plus, rotate, slerp } from './rotations.js';
 
@@ -122,11 +120,9 @@ class TrackerFrames {
 }
 
 export class Stream {
-  // fps: the network's frames per second.
   // body: { rest, floor }: head and wrists in the rest pose of the network's body, and its lowest joint's height, metres.
-  // run: takes { positions (9 numbers), rotations (27), fresh } of a frame and resolves to { positions (66),
-  //      rotations (198), joints (66) } as the full graph gives them; with `fresh` it forgets the past.
-  // offsets: { positions, rotations } of the joints on the devices, as `calibrate` finds them, or null.
+  // run: takes { positions (9 numbers), rotations (27), fresh } of a frame; `fresh` forgets the past. Resolves to
+  //      { positions (66), rotations (198), joints (66) }. offsets: as `calibrate` finds them, or null.
   // scale: the network's body height over the person's (memmlp.live.wearer); the floor is at height 0.
   constructor({ fps, body, run, offsets = null, scale = 1 }) {
     Object.assign(this, { body, run, offsets, scale });
@@ -183,9 +179,7 @@ export class Stream {
         fresh: restarted && index === 0,
       });
     }
-    const metres = joints => joints.map(x => x / scale);
-    const { time } = frames.at(-1);
-    return { time, positions: metres(made.positions), rotations: made.rotations, joints: metres(made.joints), held, fresh: true, restarted };
+    return { time: frames.at(-1).time, positions: made.positions.map(x => x / scale), rotations: made.rotations, joints: made.joints.map(x => x / scale), held, fresh: true, restarted };
   }
 
   // Learn the offsets from a person who stands upright in T-pose, and use them from now on. The line between the hands
@@ -214,8 +208,7 @@ export class Stream {
     const distances = offsets.positions.map(place => Math.hypot(...place));
     const farthest = Math.max(...distances);
     if (farthest > FAR) {
-      const name = TRACKERS[distances.indexOf(farthest)];
-      throw new Error(`${name} is ${(100 * farthest).toFixed(0)} cm from its joint in a T-pose; stand upright with straight arms to the sides`);
+      throw new Error(`${TRACKERS[distances.indexOf(farthest)]} is ${(100 * farthest).toFixed(0)} cm from its joint in a T-pose; stand upright with straight arms to the sides`);
     }
     Object.assign(this, { offsets, scale });
     this.reset();

@@ -59,11 +59,7 @@ class VrPage {
         }),
         h('label', { class: 'field' }, h('span', {}, 'Your height [cm]'), this.height)),
       this.remark, this.support,
-      this.view = h('div', { class: 'replay', hidden: true }, h('div', { class: 'view' }, h('div', { class: 'view-stage' }, this.canvas)), this.facts.element),
-      h('ol', { class: 'steps' },
-        h('li', {}, 'Put on the headset, open this page in its browser, and choose Enter VR (or AR, to see your room).'),
-        h('li', {}, 'Pull a trigger, or pinch, and stand in T-pose within three seconds: upright, arms to the sides, palms down, eyes forward.'),
-        h('li', {}, 'Look into the mirror. Pull again to repeat the calibration, such as after changing between controllers and hands.')));
+      this.view = h('div', { class: 'replay', hidden: true }, h('div', { class: 'view' }, h('div', { class: 'view-stage' }, this.canvas)), this.facts.element));
   }
 
   // Load the network, and ask the browser which modes it can enter.

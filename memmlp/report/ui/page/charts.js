@@ -71,16 +71,10 @@ export function curves(series, { label, log = false, smooth = 0, colours }) {
   return figure(`${label} by step. ${last.filter(Boolean).join('; ')}.`, draw);
 }
 
-// A run without NaN values, as an exponential mean without bias at the beginning; weight 0 keeps the values.
-function smoothed({ steps, values, ...run }, weight) {
-  let [sum, norm] = [0, 0];
-  const means = values.map(value => {
-    if (value === null) return null;
-    [sum, norm] = [weight * sum + (1 - weight) * value, weight * norm + (1 - weight)];
-    return sum / norm;
-  });
+// A run without NaN values, blurred over a radius of some points.
+function smoothed({ steps, values, ...run }, radius) {
   const known = (_, i) => values[i] !== null;
-  return { ...run, steps: steps.filter(known), values: means.filter(known) };
+  return { ...run, steps: steps.filter(known), values: d3.blur(values.filter(known), radius) };
 }
 
 // Mean and extremes of several runs, interpolated at steps that all of them cover.

@@ -40,7 +40,7 @@ export function curvePanel(ids, groupings) {
     const tools = h('div', { class: 'tools' },
       groupings.length > 1 ? select('Group by', groupings.map(([value, text]) => [value, text]), groupName, group => set({ group })) : null,
       select('Scale', [['no', 'linear'], ['yes', 'log']], log ? 'yes' : 'no', value => set({ log: value })),
-      h('label', { class: 'field' }, h('span', {}, 'Smooth'), h('input', { type: 'range', min: 0, max: 0.98, step: 0.02, value: smooth, onchange: event => set({ smooth: event.target.value }) })),
+      h('label', { class: 'field' }, h('span', {}, 'Smooth'), h('input', { type: 'range', min: 0, max: 20, value: smooth, onchange: event => set({ smooth: event.target.value }) })),
       select('Add a curve', [['', 'choose'], ...names.filter(name => !list.includes(name)).map(name => [name, title(name)])], '', name => name && set({ y: [...list, name].join('|') })),
       chosen.length ? h('button', { type: 'button', onclick: () => set({ y: '' }) }, 'Default curves') : null);
     replace(element, tools, groups.length > 1 ? h('div', { class: 'keys' }, groups.map(key)) : null, h('div', { class: 'charts' }, charts));

@@ -44,9 +44,7 @@ async function show() {
   }
 }
 
-function showStatus(text, className = '') {
-  Object.assign(document.getElementById('status'), { textContent: text, className });
-}
+const showStatus = (textContent, className = '') => Object.assign(document.getElementById('status'), { textContent, className });
 
 addEventListener('hashchange', show);
 document.querySelector('.skip').addEventListener('click', event => { event.preventDefault(); content.focus(); });

@@ -78,7 +78,7 @@ class Player extends Viewer {
       { fps, label: 'error [cm] by second', go: time => this.choose(Math.round(time * fps)), marks: worst, colours: COLOURS });
     this.newest.remove();
     this.element.append(h('div', { class: 'pieces' }, this.pieces.map(({ button }) => button)),
-      h('div', { class: 'keys' }, shown.map(([run], i) => h('span', { class: 'key still' }, h('i', { style: `background:${COLOURS[i]}` }), nameOf(run)))), this.chart);
+      h('div', { class: 'keys' }, shown.map(([run], i) => h('span', { class: 'key' }, h('i', { style: `background:${COLOURS[i]}` }), nameOf(run)))), this.chart);
     this.describe({ ...body, top: Math.max(...shown.map(([, { top }]) => top)) });
   }
 

@@ -58,7 +58,7 @@ function facts(run) {
     ['data', h('code', {}, dataName(run.data) || '–')], ['device', run.device || '–'], ['code', h('code', {}, run.code || '–')],
     run.prerequisite && ['prerequisite', link(address('run', run.prerequisite), run.prerequisite.slice(0, 8))],
     run.control && ['control', [link(address('run', run.control.id), nameOf(run.control)), ' · ', link(address('compare', '', { runs: `${run.id},${run.control.id}` }), 'compare')]],
-  ].filter(Boolean), 'facts');
+  ].filter(Boolean));
 }
 
 // Custom metrics come after the field's.
@@ -150,8 +150,7 @@ function latency({ latency: found }) {
     ['times the yardstick', number(found.ratio_to_yardstick, 2)], ['parameters', number(found.parameters)], ['MACs of a step', number(found.step_macs ?? found.macs)],
     ['ONNX file', found.onnx_bytes && bytes(found.onnx_bytes)], ['graph', found.graph], ['parity with torch', found.onnx_parity && number(found.onnx_parity)], ['precision', found['settings.precision']],
   ];
-  const share = number((100 * found.p95_ms * 60) / 1000, 1);
-  return section('Latency', h('p', { class: 'faint' }, `One streaming step on ${found.threads ?? 1} thread; p95 is ${share} % of a frame’s time at 60 Hz.`), pairs(shown.filter(([, value]) => value !== undefined)));
+  return section('Latency', h('p', { class: 'faint' }, `One streaming step on ${found.threads ?? 1} thread.`), pairs(shown.filter(([, value]) => value !== undefined)));
 }
 
 function files(run) {
@@ -160,9 +159,9 @@ function files(run) {
   const manifest = Object.entries(run.manifest).filter(([key]) => !/^(attempts|sources|seconds|prerequisite_runs)/.test(key)).map(([key, value]) => [key, word(value)]);
   return section('Files and origin',
     h('details', {}, h('summary', {}, `${run.files.length} files, ${bytes(sum)}`), table(null, run.files.map(file => [name(file), bytes(file.bytes), run.changed.includes(file.name) ? 'changed' : '']))),
-    manifest.length ? h('details', {}, h('summary', {}, 'Manifest'), pairs(manifest)) : null);
+    h('details', {}, h('summary', {}, 'Manifest'), pairs(manifest)));
 }
 
-function pairs(rows, kind = 'pairs') {
-  return h('dl', { class: kind }, rows.map(([key, value]) => h('div', {}, h('dt', {}, key), h('dd', {}, value))));
+function pairs(rows) {
+  return h('dl', { class: 'facts' }, rows.map(([key, value]) => h('div', {}, h('dt', {}, key), h('dd', {}, value))));
 }

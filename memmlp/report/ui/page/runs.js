@@ -60,9 +60,8 @@ export async function page(name, route) {
   const ui = { drawn: STEP };
   const counted = h('p', { class: 'count', role: 'status' });
   const dataSets = h('p', { class: 'best' });
-  const chips = h('div', { class: 'chips', role: 'group', 'aria-label': 'Status' });
   const table = h('table', { class: 'runs' });
-  const more = h('button', { type: 'button', class: 'more', onclick: () => { ui.drawn += STEP * 4; body(); } });
+  const more = h('button', { type: 'button', onclick: () => { ui.drawn += STEP * 4; body(); } });
   const compare = h('button', { type: 'button', class: 'primary', title: 'Choose runs in the first column', onclick: () => { location.hash = address('compare', '', { runs: place().query.get('sel') }); } });
   const set = changes => { remember(changes); draw(); };
   const filter = h('input', {
@@ -74,33 +73,25 @@ export async function page(name, route) {
 
   function draw() {
     const { query } = place();
-    const settings = { text: query.get('filter') ?? '', sort: query.get('sort') ?? '-started', status: query.get('status') ?? '' };
+    const settings = { text: query.get('filter') ?? '', sort: query.get('sort') ?? '-started' };
     if (filter.value !== settings.text) filter.value = settings.text;
     const tests = parse(settings.text);
-    const found = [...runs.values()].filter(run => (!only || only.includes(run.id)) && matches(tests, run));
-    ui.list = sorted(settings.status ? found.filter(run => run.status === settings.status) : found, settings.sort);
+    ui.list = sorted([...runs.values()].filter(run => (!only || only.includes(run.id)) && matches(tests, run)), settings.sort);
     ui.data = [...new Set(ui.list.filter(run => FINISHED.includes(run.status)).map(run => run.data))];
     const networks = ui.list.filter(run => run.kind === 'memmlp'); // a VQ-VAE has few of their keys
     const metrics = !networks.length ? about.metrics.filter(one => one.startsWith('vqvae.')).slice(0, 5) : only ? about.metrics.filter(one => !one.includes('GT ')) : METRICS;
     const measured = metrics.filter(one => ui.list.some(run => typeof run.metrics[one] === 'number'));
     const groups = [differing(networks.length ? networks : ui.list, about.keys).slice(0, only ? undefined : KEYS), measured];
     ui.columns = (NARROW.matches ? groups.reverse() : groups).flat();
-    drawStates(found, settings.status);
     head(settings.sort);
     body();
     selection();
-    replace(counted, `${number(ui.list.length)} of ${number(runs.size)} runs`);
+    const count = name => ui.list.filter(run => run.status === name).length;
+    replace(counted, [`${number(ui.list.length)} of ${number(runs.size)} runs`, ...STATES.filter(count).map(name => `${number(count(name))} ${STATE_WORDS[name] ?? name}`)].join(', '));
     replace(dataSets, ui.data.length > 1 ? `On ${ui.data.length} data sets, whose errors are not comparable; filter by one: ${ui.data.slice(0, 5).map(data => `data=${data}`).join(', ')}` : null);
     scroll.hidden = !ui.list.length;
-    replace(nothing, ui.list.length ? null : runs.size ? empty('No run matches.', h('button', { type: 'button', onclick: () => set({ filter: '', status: '' }) }, 'Show all runs'))
+    replace(nothing, ui.list.length ? null : runs.size ? empty('No run matches.', h('button', { type: 'button', onclick: () => set({ filter: '' }) }, 'Show all runs'))
       : empty('There are no runs yet.', h('p', {}, 'They appear here as soon as one starts:'), h('pre', {}, 'memmlp demo\nmemmlp train data=synth profile=tiny'), h('p', { class: 'faint' }, `Searched in: ${about.outputs}/runs`)));
-  }
-
-  function drawStates(found, status) {
-    const count = name => found.filter(run => run.status === name).length;
-    const known = STATES.filter(name => count(name) || name === status);
-    replace(chips, [['', 'all', found.length], ...known.map(name => [name, STATE_WORDS[name] ?? name, count(name)])].map(([name, text, many]) =>
-      h('button', { type: 'button', class: `chip ${name}`, 'aria-pressed': String(name === status), onclick: () => set({ status: name }) }, text, h('b', {}, number(many)))));
   }
 
   function head(sort) {
@@ -168,7 +159,7 @@ export async function page(name, route) {
   const element = h('div', { class: 'page wide' },
     only && h('p', { class: 'trail' }, link('#/runs', 'Runs')),
     h('div', { class: 'bar' }, h('h1', {}, title), counted, h('label', { class: 'search' }, h('span', { class: 'hidden' }, 'Filter of runs'), filter), compare),
-    h('div', { class: 'bar' }, chips, dataSets), scroll, nothing, panel && section('Curves', panel.element));
+    dataSets, scroll, nothing, panel && section('Curves', panel.element));
   async function update() {
     draw();
     await panel?.update();

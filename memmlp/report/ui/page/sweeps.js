@@ -28,8 +28,7 @@ function progress(sweep) {
   const before = words(sweep.prerequisite_counts);
   const text = `${words(sweep.counts)}${missing}${before ? `; prerequisites: ${before}` : ''}`;
   const remaining = sweep.remaining === null ? '' : ` · about ${duration(sweep.remaining)} of training remaining`;
-  const parts = ORDER.filter(name => sweep.counts[name]).map(name => h('i', { class: look(name), style: `flex-grow:${sweep.counts[name]}` }));
-  return h('span', { class: 'sweep-progress' }, h('span', { class: 'segments', role: 'img', 'aria-label': text }, parts), h('span', { class: 'n' }, `${Math.floor(100 * sweep.share)} %`), h('small', { class: 'faint' }, `${text}${remaining}`));
+  return h('span', {}, h('progress', { value: sweep.share, max: 1, 'aria-label': 'done' }), ` ${Math.floor(100 * sweep.share)} % `, h('small', {}, `${text}${remaining}`));
 }
 
 export async function single(name) {
