@@ -30,7 +30,9 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     outputs = tmp_path_factory.mktemp("home") / "outputs"
     make_outputs(outputs)
     started_run(outputs)
-    (outputs / "runs" / ("0" * 16)).mkdir()
+    damaged = outputs / "runs" / ("0" * 16)
+    damaged.mkdir()
+    (damaged / "manifest.json").write_text("{")
     evil = started_run(outputs, "e" * 16)
     evil.config_path.write_text(
         json.dumps({"memory": {"name": EVIL}, "seed": 9, EVIL: EVIL, "optim": {"steps": 900}})
@@ -214,7 +216,7 @@ def test_data_is_never_markup_and_damage_is_shown(browser: Browser, server: Runs
         assert browser.value("typeof owned") == "undefined"
     go(browser, server.url, f"run/{'0' * 16}", "document.querySelector('.warning')")
     words = browser.value("document.querySelector('.warning').textContent")
-    assert "manifest.json, config.yaml cannot be read" in words
+    assert "manifest.json: cannot be read" in words
 
 
 def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: RunsServer):
