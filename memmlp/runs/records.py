@@ -318,7 +318,7 @@ def _find_reason(path: Path, kind: Any, stamp: Stamp) -> str | None:
 
 @functools.lru_cache(CACHED_FILES)
 def _parse(path: Path, kind: Any, stamp: Stamp) -> tuple[dict[str, Any], str | None]:
-    """Return the record, and None or the reason why there is none."""
+    """Return the record, and the reason why it cannot be read, or None."""
     try:
         content = path.read_bytes()
         value = parse_yaml(content.decode()) if path.suffix == ".yaml" else parse_json(content)
