@@ -55,7 +55,7 @@ def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
     assert Run.from_id(home / "outputs", second).config["seed"] == 1
     (words,) = re.findall(r"next: memmlp (.*)", said)
     assert f"outputs/runs/{first}" in command(home, *shlex.split(words), "export.graph=off")
-    assert len(list((home / "outputs/runs").iterdir())) == 4  # none made anew
+    assert len(list((home / "outputs/runs").iterdir())) == 4  # none was repeated
 
 
 def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):

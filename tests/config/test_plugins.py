@@ -1,4 +1,4 @@
-"""Packages of one's own: which are used, what they add, and that nothing is imported that nobody named."""
+"""Users' packages: which are used, what they add, and that nothing is imported that nobody named."""
 
 import importlib
 import sys

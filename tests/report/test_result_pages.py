@@ -55,7 +55,7 @@ def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept
 
 
 def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: KeptResults):
-    """Counted anew from the cells; an effect without a sign in the paper is not."""
+    """Counted again from the cells; an effect without a sign in the paper is not."""
     made = source(sweep, kept)
     text = fill('{{ held(["t"]) }}', made)
     cells = [row.cells["stream"][metric] for row in made.table.rows for metric in made.table.measured_metrics]
@@ -71,7 +71,7 @@ def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: KeptR
 
 
 def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Sweep, kept: KeptResults):
-    """Counted anew from Holm's p-values; the coarser table is the one that the source makes."""
+    """Counted again from Holm's p-values; the coarser table is the one that the source makes."""
     made = source(sweep, kept)
 
     def coarser(patterns: Sequence[str]):

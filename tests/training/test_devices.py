@@ -59,7 +59,7 @@ def test_without_gpus(gpus, monkeypatch: pytest.MonkeyPatch):
 def test_a_gpu_that_torch_cannot_use_is_told(gpus, monkeypatch, tmp_path):
     for name, visible, count, driver, said in (
         ("auto", None, 0, True, True), ("auto", "0", 0, True, True), ("cpu", None, 0, True, False),
-        ("auto", None, 1, True, False), ("auto", None, 0, False, False),  # torch uses it; there is none
+        ("auto", None, 1, True, False), ("auto", None, 0, False, False),  # torch uses it, where one exists
         ("auto", "", 0, True, False), ("auto", "-1", 0, True, False),  # hidden on purpose
     ):  # fmt: skip
         gpus(count)

@@ -62,7 +62,7 @@ UNTRIED = {
     "paths.outputs", "plugins",  # change no run
     "data.root", "data.sources", "data.synth", "data.body",  # other clips or bodies are another digest
     "data.interpolation", "data.split.per_group", "data.split.divide",  # without use here: tests/motion
-    "term", "evaluation.metrics",  # of a package of one's own: tests/config/test_plugins.py
+    "term", "evaluation.metrics",  # of a user's package: tests/config/test_plugins.py
     "prerequisite", "refiner",  # runs of their own: test_sage.py, test_refiner.py
     "vqvae.epochs",  # steps by another name
     "optim.best_by",  # keeps the weights of another validation: test_best_weights.py

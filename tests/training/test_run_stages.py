@@ -198,7 +198,7 @@ def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(t
 
 
 def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Those of one's own, whose code is in the report; without them no package has to do with the errors."""
+    """Users' packages, whose code is in the report; without them no package has to do with the errors."""
     code, run = tmp_path / "mine.py", Run(tmp_path / "run")
     monkeypatch.syspath_prepend(tmp_path)
     code.write_text("A = 1\n")

@@ -58,7 +58,7 @@ TWO = """Promise.all([import('./vr.js'), fetch('site.json')]).then(async ([{ vr 
   delete document.documentElement.dataset.vr;
   vr(page, site);
 })"""
-"""The wearer's page anew, with a second network to choose."""
+"""The VR page again, with a second network to choose."""
 REMARKED = "document.querySelector('#remark').textContent"
 OPEN = "document.querySelector('nav a[aria-current]')?.hash"
 TOLERANCE = 1e-4  # metres

@@ -27,7 +27,7 @@ def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
 
 
 FORMATTED = [  # seeds' values, effect, metric, and their texts
-    # below a tenth, of a metric of one's own, which may have any unit
+    # below a tenth, of a custom metric, which may have any unit
     ({0: 0.0031, 1: 0.0035}, Effect(-0.0004, low=-0.0011, high=0.0003), "slide", "0.0033 ± 0.0003",
      (f"{MINUS}0.00040", f"[{MINUS}0.00110, 0.00030]")),
     ({0: 0.0031}, Effect(0.0004), "slide", "0.0031", ("+0.0004",)),
