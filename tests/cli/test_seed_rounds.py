@@ -153,7 +153,7 @@ def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monk
         out = memmlp(*SWEEP).out
     assert "there is nothing to compare: same" in out
     assert "all verdicts are decided" not in out
-    runs.version, runs.groups = "anew", dict.fromkeys(CLIPS, "one take")
+    runs.version, runs.groups = "second version", dict.fromkeys(CLIPS, "one take")
     Path("outputs/sweeps/trial/rounds.json").unlink()
     runs.made.clear()
     out = memmlp(*SWEEP).out
