@@ -20,13 +20,13 @@ from own_package import PACKAGE, registers_kept
 from memmlp.cli.main import COMMANDS, commands
 from memmlp.cli.workers import Workers, split_executor
 from memmlp.common.components import list_component_names as component_names
+from memmlp.common.overrides import flatten
 from memmlp.config.build import build_untrained
 from memmlp.config.compose import compose_config, compose_jobs, compose_plain, parse_hydra_arguments
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.plugins import activate
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.motion.importing.skeleton_map import SkeletonMap
-from memmlp.runs.identity import flatten
 from memmlp.sweep.search.search_file import parse_search
 from memmlp.sweep.sweep_file import load_sweep
 

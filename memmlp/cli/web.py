@@ -85,9 +85,9 @@ def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 
 def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     """Return a run's network with the facts that the site shows."""
+    from memmlp.common.overrides import flatten
     from memmlp.live.web.site import SiteNetwork
     from memmlp.networks.streaming import check_is_stream
-    from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import count_training_frames, get_run_name, warn_if_hardly_trained
 
     network = opened.network()

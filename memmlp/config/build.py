@@ -25,7 +25,7 @@ from memmlp.common.components import (
     find_component,
 )
 from memmlp.common.errors import InputError
-from memmlp.common.overrides import format_value
+from memmlp.common.overrides import flatten, format_value
 from memmlp.common.text_formats import escape_interpolations
 from memmlp.config import plugins
 from memmlp.config.build_request import build_request, read_source_weights
@@ -43,7 +43,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
-from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, find_option, flatten, select_training_config
+from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, find_option, select_training_config
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import check_trained, describe_kind, find_outputs
 from memmlp.runs.run import Run

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.components import Component, component, find_component
 from memmlp.common.errors import InputError
+from memmlp.common.overrides import flatten
 from memmlp.common.settings import Settings, at_least, positive, setting
 from memmlp.config import plugins
 from memmlp.motion.clip import LINES
@@ -21,7 +22,6 @@ from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.find_clips import NamedFolders, Root
 from memmlp.motion.preparing.persons import Kind, PersonSplit
 from memmlp.motion.preparing.splits import ListSplit, MixedSplit, SeededSplit, Split, SubsetSplit
-from memmlp.runs.identity import flatten
 from memmlp.training.request import RunRequest
 
 SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit, "persons": PersonSplit}

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from memmlp.common.components import SLOTS, find_component, list_component_names
 from memmlp.common.settings import (
     DEVICE,
+    PRECISIONS,
     SIZES,
     Rule,
     Settings,
@@ -28,7 +29,6 @@ from memmlp.common.settings import (
     within,
 )
 from memmlp.common.text_formats import escape_interpolations
-from memmlp.runs.deployment_folder import ONNX_FILES
 
 
 @dataclass
@@ -262,7 +262,7 @@ class ExportConfig:
     graph: str = setting(one_of("auto", "streaming", "naive", "off"), "auto")
     # int8, int8_blocks (for networks without a window) and fp16 write an additional file beside the float32
     # file. memmlp live uses integers if MPJPE grows by at most 1 % and Jitter by at most 10 %
-    precision: str = setting(one_of(*ONNX_FILES), "fp32")
+    precision: str = setting(one_of(*PRECISIONS), "fp32")
     alone: bool = setting(default=False)  # true: also time only the network, as papers do (Table 17)
     # the operator set of the ONNX files; older inference engines need 15
     opset: int = setting(within(15, 26), 18)

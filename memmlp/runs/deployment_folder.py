@@ -8,16 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.files import file_digest, now, to_number, write_json
+from memmlp.common.settings import PRECISIONS
 from memmlp.runs import records
 from memmlp.runs.identity import belongs_to_folder, find_deployment_versions, hash_deployment_settings
 
-ONNX_FILES = {
-    "fp32": "step.onnx",
-    "int8": "step.int8.onnx",
-    "int8_blocks": "step.int8_blocks.onnx",
-    "fp16": "step.fp16.onnx",
-}
+ONNX_FILES = {name: "step.onnx" if name == "fp32" else f"step.{name}.onnx" for name in PRECISIONS}
 """The ONNX file names, by precision (`export.precision`)."""
+
 INT8_PRECISIONS = ("int8", "int8_blocks")
 """The precisions for live use, if accurate enough: at the paper's sizes, they are faster than float32."""
 
@@ -68,9 +65,7 @@ class DeploymentFolder:
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write the measurements and the files' digests; this marks the deployment as complete."""
-        from memmlp.runs.environment import (
-            describe_environment,
-        )  # slow to import, and the config needs ONNX_FILES
+        from memmlp.runs.environment import describe_environment  # slow to import
 
         files = map(self.onnx_path, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}

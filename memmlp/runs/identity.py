@@ -20,6 +20,7 @@ from typing import Any
 
 from memmlp.common.components import SLOTS, collect_components
 from memmlp.common.files import make_json_safe
+from memmlp.common.overrides import flatten
 
 VERSIONS: dict[str, int] = {
     # the inputs of networks (memmlp.motion)
@@ -361,14 +362,3 @@ def _normalize_numbers(value: Any) -> Any:
     if isinstance(value, float) and value.is_integer():
         return int(value)
     return value
-
-
-def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Convert a nested mapping to a flat one with dotted keys; lists are not changed."""
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import to_number
+from memmlp.common.overrides import flatten
 from memmlp.runs.deployment_folder import replace_with_deployed_times
 from memmlp.runs.evaluation_file import add_solver_names
-from memmlp.runs.identity import SLOTS, find_option, flatten, select_training_config
+from memmlp.runs.identity import SLOTS, find_option, select_training_config
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.run import STATUSES, Run
 

@@ -12,8 +12,8 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
+from memmlp.common.overrides import flatten
 from memmlp.config.compose import compose_config
-from memmlp.runs.identity import flatten
 from memmlp.sweep.definition import COSTS
 from memmlp.sweep.sweep_file import load_sweep
 

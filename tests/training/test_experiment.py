@@ -12,11 +12,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from memmlp.common.overrides import flatten
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import compose_config
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.motion.dataset import MotionDataset
-from memmlp.runs.identity import NEUTRAL, flatten
+from memmlp.runs.identity import NEUTRAL
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
 from memmlp.training.run_stages import Experiment, make_prerequisites

@@ -43,9 +43,9 @@ def show(run: str, config: bool, outputs: Path) -> None:
 
     RUN is an id, the beginning of an id, or a folder.
     """
+    from memmlp.common.overrides import flatten
     from memmlp.report.tables.measured_run import load_measured_run
     from memmlp.runs.evaluation_file import add_solver_names
-    from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import find_run, is_trained
 
     found = find_run(outputs, run)
@@ -157,8 +157,8 @@ def list_result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
 
 def _list_origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
     """Return a row for each difference in code or machine, which can affect results of equal configs."""
+    from memmlp.common.overrides import flatten
     from memmlp.runs.deployment_folder import describe_timing_machine
-    from memmlp.runs.identity import flatten
 
     a, b = (
         flatten({key: run.manifest.get(key) for key in ORIGIN_KEYS})
@@ -196,9 +196,9 @@ def format_value(record: Record, key: str, whole: bool = False) -> str:
 
 def collect_measured_numbers(run: Run) -> dict[str, Any]:
     """Return the numbers in a run's results by dotted key; the keys include the inverse kinematics' name."""
+    from memmlp.common.overrides import flatten
     from memmlp.runs.deployment_folder import replace_with_deployed_times
     from memmlp.runs.evaluation_file import add_solver_names
-    from memmlp.runs.identity import flatten
 
     results = add_solver_names(run.results, run.configured_evaluations.combined_solvers)
     return {

@@ -12,10 +12,11 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import make_json_safe
+from memmlp.common.overrides import flatten
 from memmlp.runs import records
 from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import ConfiguredEvaluations, add_solver_names
-from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, find_training_settings, flatten
+from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, find_training_settings
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.run import Run, name_latency
 

@@ -11,12 +11,13 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import make_json_safe
+from memmlp.common.overrides import flatten
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.table_text import find_direction, find_unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, read_config
 from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import add_solver_names, read_report
-from memmlp.runs.identity import NETWORK, NEUTRAL, flatten, is_data_path
+from memmlp.runs.identity import NETWORK, NEUTRAL, is_data_path
 from memmlp.runs.lookup import count_training_frames, is_trained, warn_if_hardly_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from memmlp.common.files import digest, file_digest, make_json_safe
+from memmlp.common.overrides import flatten
 from memmlp.runs import records
 from memmlp.runs.deployment_folder import replace_with_deployed_times
 from memmlp.runs.evaluation_file import add_solver_names
-from memmlp.runs.identity import flatten
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.metrics_log import MetricsLog, parse_record
 from memmlp.runs.run import Run
