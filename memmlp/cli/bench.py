@@ -126,18 +126,9 @@ def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> lis
 
 
 def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, float]:
-    """Summarize a file's times.
-
-    Args:
-        prefix: the beginning of the keys.
-        times: the file's times.
-        base: the times of the reference file.
-
-    Returns:
-        The median and 95th percentile in milliseconds. The ratio of the file's median to the reference's: its
-        median, minimum and maximum over the rounds. The minimum, over the rounds, of the fraction of time in
-        which the thread had a core.
-    """
+    """Summarize a file's times, under keys with this prefix: median and 95th percentile in milliseconds; the
+    ratio of its median to the reference file's: median, minimum and maximum over the rounds; and the minimum,
+    over the rounds, of the fraction of time in which the thread had a core."""
     import numpy as np
 
     ratios = np.median(times.seconds, 1) / np.median(base.seconds, 1)

@@ -20,15 +20,9 @@ FULL_TOLERANCE = 0.1
 
 
 class ExportForm(NamedTuple):
-    """The requested form of an ONNX file.
-
-    Attributes:
-        graph: "auto", "streaming" or "naive".
-        precision: "fp32", "fp16", "int8" or "int8_blocks".
-        opset: the file's ONNX opset.
-        full: the frame of reference and the format of the joints' rotations, for a file that computes joints
-            from tracker poses; None for a file with only the network's step.
-    """
+    """The requested form of an ONNX file. `full` is the frame of reference and the format of the joints'
+    rotations, for a file that computes joints from tracker poses; None for a file with only the network's
+    step."""
 
     graph: str
     precision: str
@@ -132,11 +126,8 @@ def export(
 
 
 def copy_deployed(run: Run, out: Path, form: ExportForm, max_growth: float) -> str | None:
-    """Copy the file of the requested form from a deployment of the run.
-
-    Returns:
-        A line about the file's recorded check; None if no deployment has such a file.
-    """
+    """Copy the file of the requested form from a deployment of the run. Return a line about the file's
+    recorded check; None if no deployment has such a file."""
     from memmlp.common.files import atomic_write, file_digest
 
     for folder in sorted(run.deployments.glob("*")):
@@ -194,14 +185,9 @@ def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, 
 
 
 def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
-    """Write the float32 ONNX file if it matches the trained network on the longest test clip.
-
-    Returns:
-        A line about the difference between file and network.
-
-    Raises:
-        ClickException: if file and network differ by more than rounding errors; then nothing is written.
-    """
+    """Write the float32 ONNX file if it matches the trained network on the longest test clip, and return a
+    line about the difference. Raises ClickException if they differ by more than rounding errors; then nothing
+    is written."""
     from memmlp.common.progress import announce
     from memmlp.deploy.parity import TOLERANCE, is_rounding, measure_differences, select_parity_clips
     from memmlp.live.trackers_to_body_graph import measure_full_differences
@@ -229,25 +215,11 @@ def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
 
 
 def write_lower(opened: OpenedRun, out: Path, form: ExportForm, max_growth: float) -> str:
-    """Write the ONNX file with lower precision if it is accurate enough.
-
-    The loss of accuracy is measured for the network's step. A full graph has the same layers, so it is
-    measured in the same way, and also compared with torch on the first test clip.
-
-    Args:
-        opened: the run.
-        out: the file to write.
-        form: the requested form.
-        max_growth: the maximum relative increase of MPJPE (0.01 is 1 %).
-
-    Returns:
-        A line about the loss of accuracy.
-
-    Raises:
-        InputError: for a network without a streaming graph.
-        ClickException: if MPJPE increases by more, or a full graph does not match the network; then nothing
-            is written.
-    """
+    """Write the ONNX file with lower precision if it is accurate enough, and return a line about the loss of
+    accuracy. It is measured for the network's step. A full graph has the same layers, so it is measured in
+    the same way, and also compared with torch on the first test clip. `max_growth` is the maximum relative
+    increase of MPJPE. Raises InputError for a network without a streaming graph, and ClickException if MPJPE
+    increases by more, or a full graph does not match the network; then nothing is written."""
     from memmlp.common.errors import InputError
     from memmlp.common.progress import announce
     from memmlp.deploy.lower_precision import compare_accuracy, write_lower_precision

@@ -208,11 +208,8 @@ def make_source(options: LiveOptions) -> TrackerSource:
 
 
 def load_tracked_clip(options: LiveOptions) -> TrackedClip:
-    """Load the clip of --clip: an AMASS npz file on the network's body, or a test clip of the run.
-
-    Raises:
-        InputError: for an unknown test clip, or for a test clip of an ONNX file.
-    """
+    """Load the clip of --clip: an AMASS npz file on the network's body, or a test clip of the run. Raises
+    InputError for an unknown test clip, or for a test clip of an ONNX file."""
     from memmlp.common.errors import InputError
     from memmlp.deploy.onnx_stream import check_file
     from memmlp.live.session.sources import TrackedClip, read_npz_frames
@@ -292,10 +289,8 @@ def find_network_file(options: LiveOptions) -> tuple[Path, str]:
 
 
 def combine_calibration(options: LiveOptions, space: SpaceName, stream: Stream) -> Calibration:
-    """Return the user's calibration from the options and the file of --calibration.
-
-    Options take precedence. Offsets in the file are ignored if the options set another height.
-    """
+    """Return the user's calibration from the options, which take precedence, and the file of --calibration.
+    Offsets in the file are ignored if the options set another height."""
     from memmlp.live.wearer import SAME, Calibration, compute_body_height, read_calibration
 
     body = compute_body_height(stream.network.body)

@@ -95,11 +95,9 @@ def commands() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 after an interruption.
-
-    Without `argv`, the command is the whole process. Then SIGTERM, a scheduler's request to end, acts like
-    Ctrl-C. With MEMMLP_TRACEBACK=1 in the environment, errors are raised with their traceback.
-    """
+    """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 after an interruption. Without
+    `argv`, the command is the whole process; then SIGTERM acts like Ctrl-C. With MEMMLP_TRACEBACK=1 in the
+    environment, errors are raised with their traceback."""
     is_process = argv is None
     print_in_any_encoding()
     if is_process:

@@ -92,10 +92,7 @@ def predict(
 
 def choose_branch(evaluation: Evaluation, branch: str | None) -> str:
     """Return the branch of --branch; by default combined if inverse kinematics is on, otherwise rotation.
-
-    Raises:
-        InputError: for --branch combined without inverse kinematics.
-    """
+    Raises InputError for --branch combined without inverse kinematics."""
     from memmlp.common.errors import InputError
     from memmlp.evaluation.ik import NoIK
 
@@ -108,11 +105,8 @@ def choose_branch(evaluation: Evaluation, branch: str | None) -> str:
 def predict_test_clip(
     predictor: ClipPredictor, run: OpenedRun, name: str, out: Path, format_: str | None
 ) -> ExportReport:
-    """Write the network's prediction for a test clip.
-
-    Raises:
-        InputError: if the clip does not exist, or `out` has another format or cannot be written.
-    """
+    """Write the network's prediction for a test clip. Raises InputError if the clip does not exist, or `out`
+    has another format or cannot be written."""
     from memmlp.common.errors import InputError
     from memmlp.motion.body import FPS
     from memmlp.motion.exporting import ExportReport, choose_format, write_motion

@@ -113,11 +113,8 @@ def render(
 def _predict_piece(
     runs: dict[str, OpenedRun], clip: str | None, begin: float, end: float | None, branch: str, mode: str
 ) -> ClipPiece:
-    """Return a clip between two times in seconds, with the runs' predictions by label.
-
-    Raises:
-        InputError: if the piece is empty, or the runs' ground truths for the clip differ.
-    """
+    """Return a clip between two times in seconds, with the runs' predictions by label. Raises InputError if
+    the piece is empty, or the runs' ground truths for the clip differ."""
     import numpy as np
 
     from memmlp.common.errors import InputError

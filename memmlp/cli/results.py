@@ -190,13 +190,9 @@ def make_tables(folder: Path) -> dict[str, KeptTable]:
 
 
 def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
-    """Compute the table of kept results for the sweep's seeds and all additional seeds with runs.
-
-    Args:
-        kept: the results.
-        source: show only the test clips of this source; None for all sources.
-        patterns: test clips form one group if a pattern matches the same text in their names.
-    """
+    """Compute the table of kept results for the sweep's seeds and all additional seeds with runs. With
+    `source`, only its test clips count. Test clips form one group if a pattern matches the same text in their
+    names."""
     from memmlp.cli.table import flag_changed_rounds
     from memmlp.config.compose_plan import find_sweep
     from memmlp.report.tables.build_table import make_table, restrict_and_group_clips

@@ -107,15 +107,8 @@ def sweep(
 
 
 def reset_runs(plan: Plan, failed: bool, networks: bool) -> None:
-    """Reset a plan's runs: failed runs, or all networks.
-
-    Prerequisites of networks keep their results.
-
-    Args:
-        plan: the plan.
-        failed: whether to reset failed runs.
-        networks: whether to reset all started or finished networks.
-    """
+    """Reset a plan's failed runs, or all its started or finished networks. Prerequisites keep their
+    results."""
     for task in plan.tasks if failed else ():
         plan.get_run(task).retry()
     started = [task for task in plan.tasks if networks and task.kind == NETWORK]
@@ -140,13 +133,8 @@ def list_devices(plan: Plan) -> set[str]:
 
 
 def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
-    """Print the sweep's progress, and warnings about results of older code.
-
-    Args:
-        chosen: the sweep.
-        plan: the sweep's plan.
-        labels: the labels of the variants to show.
-    """
+    """Print the progress of a sweep's variants with these labels, and warnings about results of
+    older code."""
     from memmlp.common.text_formats import make_console
     from memmlp.sweep.progress_table import render
 
@@ -173,10 +161,8 @@ def count_unprepared_runs(chosen: Sweep, plan: Plan, labels: Collection[str]) ->
 
 
 def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: Workers, folder: Path) -> None:
-    """Print the expected time of the remaining runs, and the batch file for Slurm.
-
-    VQ-VAEs are counted only for runs with prepared data.
-    """
+    """Print the expected time of the remaining runs, and the batch file for Slurm. VQ-VAEs are counted only
+    for runs with prepared data."""
     from memmlp.sweep.plan import estimate_time
 
     count = workers.count_workers(workers.make_gpu_shares(list_devices(plan)))
@@ -191,16 +177,8 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: W
 
 
 def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:
-    """Print the table, the number of finished runs, failed runs, and the next command.
-
-    Exits with 1 if a run that these variants need has failed.
-
-    Args:
-        shown: the part of the sweep that the table shows.
-        arguments: the sweep's name and overrides on the command line.
-        chosen: the sweep.
-        labels: the labels of the executed variants.
-    """
+    """Print the table `shown`, the number of finished runs, failed runs, and the next command, for the
+    executed variants. Exits with 1 if a run that these variants need has failed."""
     from memmlp.cli.table import SHOWN_MODES, make_plan_table, print_tables
     from memmlp.config import plugins
     from memmlp.config.compose_plan import get_sweep_folder
@@ -246,17 +224,9 @@ def check_rounds_options(overrides: Sequence[str], until_decided: bool, max_seed
 
 
 def load_rounds(sweep: Sweep, outputs: Path, max_seeds: int | None) -> Rounds:
-    """Load the seed rounds of a sweep; start new rounds if no interim analysis was done yet.
-
-    Args:
-        sweep: the sweep.
-        outputs: the folder of runs and caches.
-        max_seeds: the maximum number of seeds per variant (--max-seeds); None for the maximum of the saved
-            rounds, or for the default.
-
-    Raises:
-        InputError: if the saved analyses have another maximum, or the sweep has changed since.
-    """
+    """Load the seed rounds of a sweep; start new rounds if no interim analysis was done yet. `max_seeds` is
+    the maximum number of seeds per variant; None for that of the saved rounds, or the default. Raises
+    InputError if the saved analyses have another maximum, or the sweep has changed since."""
     from memmlp.cli.table import get_rounds_path
     from memmlp.report.tables.seed_rounds import MAX_SEEDS, Rounds, start_rounds
 
@@ -279,14 +249,8 @@ def load_rounds(sweep: Sweep, outputs: Path, max_seeds: int | None) -> Rounds:
 def run_until_decided(
     sweep: Sweep, outputs: Path, rounds: Rounds, work: Callable[[Sweep, Plan], None]
 ) -> tuple[Rounds, Plan]:
-    """Repeat interim analyses until no further analysis is possible; return the last rounds and plan.
-
-    Args:
-        sweep: the sweep at the start of the seed rounds.
-        outputs: the folder of runs and caches.
-        rounds: the previous seed rounds.
-        work: function that finishes the runs of a sweep's plan.
-    """
+    """Repeat interim analyses until no further analysis is possible; return the last rounds and plan. `work`
+    finishes the runs of a sweep's plan."""
     from memmlp.cli.table import get_rounds_path
     from memmlp.config.compose_plan import make_plan
     from memmlp.report.tables.seed_rounds import check_same_runs
@@ -305,10 +269,8 @@ def run_until_decided(
 
 
 def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
-    """Do the next possible interim analysis, record it, and return the seed rounds.
-
-    If another process has done an analysis in the meantime, its rounds are returned instead.
-    """
+    """Do the next possible interim analysis, record it, and return the seed rounds. If another process has
+    done an analysis in the meantime, its rounds are returned instead."""
     from dataclasses import asdict
 
     from memmlp.cli.table import get_rounds_path

@@ -132,14 +132,9 @@ def print_needed_seeds(tables: Sequence[SweepTable], modes: Sequence[str]) -> No
 
 
 class TableSelection(NamedTuple):
-    """A selection of a sweep's results for its table.
-
-    Attributes:
-        branch: the branch to show; None for each variant's default branch.
-        source: show only the test clips of this source; None for all sources.
-        together: patterns of test clips that count as one group, in addition to the groups of the data.
-        untrained: whether to measure the costs of networks without a run, with random weights.
-    """
+    """A selection of a sweep's results for its table. `branch`: None for each variant's default; `source`:
+    show only its test clips; `together`: patterns of test clips that count as one group, in addition to the
+    groups of the data; `untrained`: measure the costs of networks without a run, with random weights."""
 
     branch: str | None = None
     source: str | None = None
@@ -166,22 +161,10 @@ def gather_tables(
     read: ReadRun,
     selection: TableSelection = EVERYTHING,
 ) -> list[SweepTable]:
-    """Make the tables of one sweep, or of all tables of the paper.
-
-    If the config of a paper's table is incomplete (for example without the folder of AMASS), the table shows
-    only the paper's values and the reason.
-
-    Args:
-        name: the name of a sweep, as in `memmlp table`; `all` for all tables of the paper.
-        overrides: the command line's overrides.
-        outputs: the folder of runs and caches.
-        modes: evaluation modes to show.
-        read: function that reads a run (`memmlp.report.tables.measured_run.load`).
-        selection: the results to show.
-
-    Raises:
-        InputError: if no table can be composed with these overrides, or no table has the selected results.
-    """
+    """Make the tables of one sweep, or with `all`, of all tables of the paper. If the config of a paper's
+    table is incomplete (for example without the folder of AMASS), it shows only the paper's values and the
+    reason. `read` reads a run (`memmlp.report.tables.measured_run.load`). Raises InputError if no table can
+    be composed with these overrides, or no table has the selected results."""
     from memmlp.common.progress import progress_bar
     from memmlp.report.tables.build_table import make_empty_table
 
@@ -271,7 +254,6 @@ def align_columns(rows: Sequence[Sequence[str]], left: int) -> list[str]:
 
 
 def _format_tables(tables: Sequence[Table], form: str, alone: bool) -> str:
-    """Format the tables as one text; in JSON, a single object if `alone`, otherwise a list."""
     from memmlp.report.tables.table_text import FORMATS
 
     texts = [FORMATS[form](one) for one in tables]
@@ -300,14 +282,8 @@ def write(out: Path, text: str) -> None:
 
 
 class ShownSweep(NamedTuple):
-    """The part of a sweep that a table shows; seed rounds may have added seeds.
-
-    Attributes:
-        sweep: the sweep with the seeds that were run.
-        plan: the plan of the sweep's runs.
-        rounds: the seed rounds that decided the verdicts, or None.
-        flags: warnings for readers, if saved seed rounds do not fit the sweep.
-    """
+    """The part of a sweep that a table shows: the sweep with the seeds that were run, its plan, the seed
+    rounds that decided the verdicts (or None), and warnings if saved rounds do not fit the sweep."""
 
     sweep: Sweep
     plan: Plan
@@ -316,10 +292,8 @@ class ShownSweep(NamedTuple):
 
 
 def load_shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownSweep:
-    """Load a sweep's plan, and its seed rounds if interim analyses were done.
-
-    If the sweep has changed since the analyses, the rounds are ignored and a flag warns about them.
-    """
+    """Load a sweep's plan, and its seed rounds if interim analyses were done. If the sweep has changed since,
+    the rounds are ignored and a flag warns about them."""
     from memmlp.config.compose_plan import make_plan
     from memmlp.report.tables.seed_rounds import Rounds, check_same_runs
 
@@ -340,13 +314,8 @@ def load_shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> S
 
 
 def flag_changed_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) -> str | None:
-    """Return a warning if the sweep has changed since its interim analyses, or None.
-
-    Args:
-        kept: the saved seed rounds.
-        sweep: the sweep.
-        seeds_given: whether the command line sets the sweep's seeds.
-    """
+    """Return a warning if the sweep has changed since its interim analyses `kept`, or None. `seeds_given`:
+    the command line sets the seeds."""
     from memmlp.report.tables.seed_rounds import start_rounds
 
     other = "seeds" if seeds_given else kept.find_difference(start_rounds(sweep, len(kept.seeds)))

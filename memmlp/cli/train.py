@@ -43,15 +43,8 @@ def command(hydra_arguments: Sequence[str]) -> None:
 
 
 def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None) -> None:
-    """Run the jobs that the arguments of `memmlp train` describe.
-
-    Args:
-        argv: the arguments.
-        job: called with each checked config; by default, `run_training`.
-
-    Raises:
-        InputError: for bad input. If several jobs fail, the last failure is raised; the others are printed.
-    """
+    """Run the jobs that the arguments of `memmlp train` describe, by default with `run_training`. Raises
+    InputError for bad input. If several jobs fail, the last failure is raised; the others are printed."""
     args = parse_hydra_arguments(argv)
     only_prints = any((args.hydra_help, args.cfg, args.info, args.shell_completion))
     if args.help or args.cfg:
@@ -78,10 +71,8 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
 
 
 def _run_with_hydra(args: argparse.Namespace, train_from_config: Callable[[DictConfig], None]) -> None:
-    """Run or print the jobs with Hydra, which reads its arguments from `sys.argv`.
-
-    Errors of Hydra are raised as InputError, with a message in one line.
-    """
+    """Run or print the jobs with Hydra, which reads its arguments from `sys.argv`. Errors of Hydra are raised
+    as InputError, with a message in one line."""
     main = hydra.main(
         config_path=str(find_packaged_folder("conf")), config_name=CONFIG, version_base=VERSION_BASE
     )
@@ -118,9 +109,7 @@ def _collect_failures(
     job: Callable[[DictConfig], object], failures: list[Exception]
 ) -> Callable[[DictConfig], None]:
     """Wrap the job: expected failures are appended to `failures`, so the other jobs of a multirun still run.
-
-    Some launchers run jobs in other processes, with copies of the list. There, failures are raised, and Hydra
-    passes the first failure on.
+    Some launchers run jobs in other processes; there, failures are raised, and Hydra passes the first one on.
     """
     collector = os.getpid()
 
@@ -136,11 +125,8 @@ def _collect_failures(
 
 
 def run_training(cfg: DictConfig) -> Outcome | None:
-    """Finish the run of a checked config, then print and return the results.
-
-    Returns:
-        The outcome; None in the additional processes of distributed training.
-    """
+    """Finish the run of a checked config, print the results, and return the outcome; None in the additional
+    processes of distributed training."""
     from memmlp.cli.train_summary import show
     from memmlp.config.build_request import build_request
     from memmlp.training.request import find_finished_outcome

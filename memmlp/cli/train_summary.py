@@ -75,11 +75,9 @@ def list_run_warnings(run: Run) -> Iterator[str]:
 
 
 def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
-    """Print the errors of several networks, by name, on the same test clips, and their costs.
-
-    The errors are in stream mode if it was measured, otherwise in window mode. If a network's branches
-    differ, each branch has a column.
-    """
+    """Print the errors of several networks, by name, on the same test clips, and their costs. The errors are
+    in stream mode if it was measured, otherwise in window mode. If a network's branches differ, each has a
+    column."""
     results = {name: outcome.results for name, outcome in outcomes.items()}
     mode = "stream" if all("stream" in own for own in results.values()) else "window"
     branches = {name: _list_distinct_branches(own[mode]) for name, own in results.items()}
@@ -151,13 +149,8 @@ def describe_stages(outcome: Outcome) -> str:
 
 
 def make_all_metrics_tables(run: Run, results: Errors, stages: Sequence[str]) -> Iterator[Table]:
-    """Yield a table of the metrics on all test clips, and one for each source if there are several.
-
-    Args:
-        run: the run.
-        results: the means by mode, branch and metric.
-        stages: the identities of the evaluations to show.
-    """
+    """Yield a table of the metrics (means by mode, branch and metric) on all test clips, and one for each
+    source if there are several. `stages` are the identities of the evaluations to show."""
     measured = load_measured_run(run.folder, stages)
     yield make_metrics_table(replace(measured, means=results))
     for source, part in measured.split_by_source().items():
@@ -165,10 +158,8 @@ def make_all_metrics_tables(run: Run, results: Errors, stages: Sequence[str]) ->
 
 
 def make_metrics_table(measured: MeasuredRun, title: str = "test clips") -> Table:
-    """Make a table of the metrics on test clips, with a column for each mode and branch.
-
-    A mean over a part of the clips is marked.
-    """
+    """Make a table of the metrics on test clips, with a column for each mode and branch. A mean over a part
+    of the clips is marked."""
     means = measured.means
     columns = [(mode, branch) for mode, branch in MODES_AND_BRANCHES if branch in means.get(mode, {})]
     headers = [f"{mode}\n{branch}" for mode, branch in columns]

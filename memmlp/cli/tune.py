@@ -65,15 +65,8 @@ def tune(
 
 
 class SearchSetup(NamedTuple):
-    """A search, its folder, and the settings of its runs.
-
-    Attributes:
-        search: the parsed search.
-        command_line: the command line's overrides for all trials.
-        outputs: the folder of runs and caches.
-        folder: the folder of the search.
-        config_dir: a folder of custom configs, or None.
-    """
+    """A search, its folder, and the settings of its runs: the command line's overrides for all trials, the
+    folder of runs and caches, and a folder of custom configs, or None."""
 
     search: Search
     command_line: tuple[str, ...]
@@ -82,11 +75,8 @@ class SearchSetup(NamedTuple):
     config_dir: Path | None
 
     def list_overrides(self, values: Mapping[str, Value]) -> list[str]:
-        """Return a trial's overrides, for the trial's values.
-
-        Overrides of the search file and of the command line come before the values. By default, trials are
-        neither exported nor timed. They are only evaluated on validation clips.
-        """
+        """Return a trial's overrides: those of the search file and the command line, then the trial's values.
+        By default, trials are neither exported nor timed, and only evaluated on validation clips."""
         fixed = self.search.budget
         return [
             "export.graph=off",
@@ -103,11 +93,7 @@ class SearchSetup(NamedTuple):
 
 
 def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: Path) -> SearchSetup:
-    """Return the search of a command line. Its keys and ranges are checked against the config.
-
-    Raises:
-        InputError: if a key is wrong; the message names it.
-    """
+    """Return the search of a command line. Raises InputError if a key or range does not fit the config."""
     from memmlp.common.files import digest
     from memmlp.config.compose import compose_plain
     from memmlp.config.plugins import activate, find_named_packages
@@ -149,17 +135,11 @@ def _complete_kinematic_loss(content: dict[str, Any], overrides: Sequence[str]) 
 
 
 def _check_space(setup: SearchSetup) -> str:
-    """Check the ranges of a search, and describe everything that affects the results of its trials.
-
-    Returns:
-        A text with the first trial's run, its validation interval, its inference settings, and the component
-        versions at the limits of the space. The folder name of the search contains a digest of this text, so
-        a search with another config or data has another folder.
-
-    Raises:
-        InputError: if a searched key is set on the command line or does not affect training, or if the
-            config rejects a value.
-    """
+    """Check the ranges of a search, and return a text with everything that affects the results of its trials:
+    the first trial's run, its validation interval, its inference settings, and the component versions at the
+    limits of the space. The folder name of the search contains a digest of this text, so a search with
+    another config or data has another folder. Raises InputError if a searched key is set on the command line
+    or does not affect training, or if the config rejects a value."""
     from memmlp.common.files import digest
     from memmlp.runs.identity import affects_training, select_inference_config, select_validation_config
 
@@ -268,10 +248,8 @@ def write_results(setup: SearchSetup, study: Study) -> None:
 
 
 def print_summary(setup: SearchSetup, study: Study) -> None:
-    """Print the best trials, the importance of the keys, the folder, and the next command.
-
-    Exits with 1 if no trial is complete.
-    """
+    """Print the best trials, the importance of the keys, the folder, and the next command. Exits with 1 if no
+    trial is complete."""
     from rich.text import Text
 
     from memmlp.common.text_formats import make_console

@@ -55,10 +55,7 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
 
 def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
     """Return a run's prediction for a test clip (`make_prediction_arrays`), computed on one CPU thread.
-
-    Raises:
-        InputError: if the run's data is not prepared on this machine, or does not contain the clip.
-    """
+    Raises InputError if the run's data is not prepared on this machine, or does not contain the clip."""
     import torch
 
     from memmlp.common.errors import InputError

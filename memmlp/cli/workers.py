@@ -30,15 +30,9 @@ CUSTOM_PREFIX = "executor"  # prefix of the settings of a custom executor, execu
 
 @dataclass(frozen=True)
 class Workers:
-    """The workers that a command line requests.
-
-    Attributes:
-        executor: the executor's name, or the path of a class.
-        settings: the executor's settings, KEY -> VALUE of overrides like slurm.KEY=VALUE.
-        count: number of concurrent workers; None for the default of this machine.
-        gpus_per_worker: number of GPUs per worker on this machine; None for 1 if GPUs are available.
-        workers_per_gpu: maximum number of workers that share a GPU of this machine; None for no limit.
-    """
+    """The workers that a command line requests: the executor's name, or the path of a class, its settings
+    (slurm.KEY=VALUE), number of concurrent workers, GPUs per worker and maximum of workers per GPU on this
+    machine. None is this machine's default (1 GPU if available; no limit)."""
 
     executor: str = "local"
     settings: dict[str, str] = field(default_factory=dict)
@@ -83,14 +77,9 @@ class Workers:
         return count_workers(shares, self.count, self.workers_per_gpu)
 
     def make_gpu_shares(self, devices: Iterable[str]) -> list[GpuGroup]:
-        """Divide this machine's GPUs into shares for local workers, for runs on these devices.
-
-        Args:
-            devices: the values of the key `device` of the runs.
-
-        Raises:
-            InputError: if a run requests a GPU that its worker cannot use; the message names the key.
-        """
+        """Divide this machine's GPUs into shares for local workers, for runs with these values of the key
+        `device`. Raises InputError if a run requests a GPU that its worker cannot use; the message names the
+        key."""
         from memmlp.sweep.executors.local import divide_gpus, list_visible_gpus
 
         gpu_devices = [name for name in devices if name not in DEVICES_WITHOUT_GPU]
@@ -111,13 +100,8 @@ class Workers:
         return divide_gpus(gpus, self.gpus_per_worker)
 
     def start_executor(self, folder: Path, shares: Sequence[GpuGroup], gpus: bool) -> Executor:
-        """Make the executor. Its workers write logs in `folder`/workers.
-
-        Args:
-            folder: the folder of the sweep or search.
-            shares: the shares of this machine's GPUs for local workers.
-            gpus: whether runs can use a GPU.
-        """
+        """Make the executor. Its workers write logs in `folder`/workers, and share this machine's GPUs.
+        `gpus`: whether runs can use a GPU."""
         options = self.parse_options()
         if self.executor == "slurm":
             from memmlp.sweep.executors.slurm import Slurm
@@ -142,10 +126,8 @@ def get_log_path(folder: Path) -> Path:
 
 
 def add_worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the worker options to a command, which receives their values as `workers`.
-
-    The command receives the overrides without the executor's overrides as `overrides`.
-    """
+    """Add the worker options to a command, which receives their values as `workers`, and the overrides
+    without those of the executor as `overrides`."""
     options = (
         click.option(
             "--workers",
@@ -183,11 +165,8 @@ def add_worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple[str, ...]]:
-    """Split overrides into the executor's name, the executor's settings, and the remaining overrides.
-
-    Raises:
-        InputError: for an unknown executor, or settings of another executor.
-    """
+    """Split overrides into the executor's name, its settings, and the remaining overrides. Raises InputError
+    for an unknown executor, or settings of another executor."""
     executor, executor_settings, remaining = "local", [], []
     for override in map(Override.parse, overrides):
         if override.key == "executor":
@@ -207,20 +186,10 @@ def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple
 
 
 def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> tuple[Path, Fleet]:
-    """Save the plan in a new file, and return the file and a fleet of workers for it.
-
-    No worker is started yet. Each process that works on the same sweep has a separate file, so it cannot
-    change the plan of another process's workers.
-
-    Args:
-        folder: the folder of the sweep or search; workers' logs are also stored there.
-        plan: the plan to work on.
-        workers: the workers that the command line requests.
-        devices: the values of the key `device` of the plan's runs.
-
-    Raises:
-        InputError: if workers cannot get the requested GPUs.
-    """
+    """Save the plan in a new file, and return the file and a fleet of workers for it, none of which is
+    started. Each process that works on the same sweep has a separate file, so it cannot change the plan of
+    another process's workers. Raises InputError if workers cannot get the GPUs that the runs' `devices`
+    request."""
     from memmlp.config.worker_process import work
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence

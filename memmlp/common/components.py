@@ -81,17 +81,8 @@ def component(
 
 @dataclass(frozen=True)
 class Component:
-    """A declared component.
-
-    Attributes:
-        slot: the config group.
-        name: the component's name in the config.
-        version: the component version.
-        builds: the name of the class to build; None for the decorated class.
-        package: the component's package: "memmlp" or a user's package.
-        module: the module that declares it.
-        path: the module's file.
-    """
+    """A declared component: `builds` is the name of the class to build, None for the decorated class;
+    `package` is "memmlp" or a user's package; `path` is the file of the `module` that declares it."""
 
     slot: str
     name: str
@@ -118,10 +109,8 @@ class Component:
         return getattr(module, self.builds) if self.builds else _find_decorated(vars(module), self)
 
     def build(self, node: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
-        """Build the component from its keys in the config and further arguments.
-
-        A class with the parameter `settings` gets the keys in an object. Other classes get them as arguments.
-        """
+        """Build the component from its keys in the config and further arguments. A class with the parameter
+        `settings` gets the keys in an object. Other classes get them as arguments."""
         if self.builds and "settings" in inspect.signature(self.kind).parameters:
             return self.kind(*args, settings=self.make_settings(node), **kwargs)
         return self.kind(*args, **{key: value for key, value in node.items() if key != "name"}, **kwargs)
@@ -133,11 +122,7 @@ class Component:
 
 
 def find_component(slot: str, name: str) -> Component:
-    """Return the component with a name in a slot.
-
-    Raises:
-        InputError: if no package in use declares it.
-    """
+    """Return the component with a name in a slot. Raises InputError if no package in use declares it."""
     try:
         return collect_components()[slot, name]
     except KeyError:
@@ -165,11 +150,8 @@ def collect_attribute(kind: type[Settings], attribute: str) -> dict[str, Any]:
 
 @functools.cache
 def collect_components() -> dict[tuple[str, str], Component]:
-    """Return all components by slot and name, including components of users' packages.
-
-    Raises:
-        InputError: if two packages declare the same option.
-    """
+    """Return all components by slot and name, including those of users' packages. Raises InputError if two
+    packages declare the same option."""
     components: dict[tuple[str, str], Component] = {}
     for package, root in _roots.items():
         for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
@@ -183,11 +165,8 @@ def collect_components() -> dict[tuple[str, str], Component]:
 
 
 def add_package(package: str, root: Path | None) -> None:
-    """Add the components of a user's package: a folder or a file. If `root` is None, remove them.
-
-    Raises:
-        InputError: if the package declares an option that already exists.
-    """
+    """Add the components of a user's package: a folder or a file. If `root` is None, remove them. Raises
+    InputError if the package declares an option that already exists."""
     _roots.pop(package, None)
     if root:
         _roots[package] = root
@@ -216,10 +195,7 @@ def _parse_components(package: str, path: Path) -> Iterable[Component]:
 @functools.cache
 def read_declarations(module: str, path: Path) -> dict[str, Any]:
     """Execute the declarations in a module's file without importing the module, and return them by name.
-
-    Raises:
-        InputError: if a declaration needs more than this module's docstring allows.
-    """
+    Raises InputError if a declaration needs more than this module's docstring allows."""
     space = ModuleType(f"{module}:declarations")
     sys.modules[space.__name__] = space  # where dataclasses and OmegaConf look up annotations
     kept: list[ast.stmt] = []
@@ -241,7 +217,6 @@ def read_declarations(module: str, path: Path) -> dict[str, Any]:
 
 
 def _read_imported_settings(node: ast.ImportFrom) -> dict[str, Any]:
-    """Return the settings classes that a statement imports from another module of a package in use."""
     module = str(node.module)
     for package, root in _roots.items():
         path = root.joinpath(*module.removeprefix(f"{package}.").split(".")).with_suffix(".py")

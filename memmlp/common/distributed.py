@@ -114,11 +114,8 @@ def gather_rows(rows: Tensor) -> Tensor:
 
 def draw_rows(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     """Draw random numbers for the whole batch, like a single process would, and return this process' rows.
-
-    Args:
-        draw: a function that draws random numbers, given a tensor with the shape of the whole batch.
-        like: a tensor with the shape of this process' rows (b, ...).
-    """
+    `draw` gets a tensor with the shape of the whole batch; `like` has the shape (b, ...) of this process'
+    rows."""
     if not _Step.shared:
         return draw(like)
     return take_local_rows(draw(like.detach().repeat(world_size(), *[1] * (like.dim() - 1))))

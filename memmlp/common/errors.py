@@ -15,11 +15,9 @@ def escape_line_breaks(text: str) -> str:
 
 
 class InputError(ValueError):
-    """Bad user input; the message names the file or key, the problem and the expected input.
-
-    The command line prints the message without a traceback and exits with code 2. Line breaks in the message,
-    for example from file names, are escaped.
-    """
+    """Bad user input; the message names the file or key, the problem and the expected input. The command line
+    prints it without a traceback and exits with code 2. Line breaks, for example from file names, are
+    escaped."""
 
     def __init__(self, message: str) -> None:
         super().__init__(escape_line_breaks(message))
@@ -41,32 +39,21 @@ def check_installed(package: str, extra: str, purpose: str) -> None:
 
 
 def import_optional(module: str, extra: str, purpose: str) -> ModuleType:
-    """Import and return a module of an optional package.
-
-    Args:
-        module: the module, such as "matplotlib" or "av".
-        extra: the extra of memmlp that installs it, such as "plots".
-        purpose: the override, option or file that needs the package; the message begins with it.
-
-    Raises:
-        InputError: if the package is not installed.
-    """
+    """Import and return a module of an optional package that the extra `extra` of memmlp installs. `purpose`
+    is the override, option or file that needs it; the message begins with it. Raises InputError without the
+    package."""
     check_installed(module.split(".")[0], extra, purpose)
     return importlib.import_module(module)
 
 
 class TrainingDiverged(RuntimeError):
-    """The loss became NaN or infinite.
-
-    The message is one line with the step, the loss term and the batch's clips. The exit code is 1.
-    """
+    """The loss became NaN or infinite. The one-line message has the step, the loss term and the batch's
+    clips. The exit code is 1."""
 
 
 class LeaseLost(RuntimeError):
-    """Another process took over this process' folder, because this process was frozen for too long.
-
-    This process writes nothing more to the folder. The message is one line; the exit code is 1.
-    """
+    """Another process took over this process' folder, because this process was frozen for too long. This
+    process writes nothing more to the folder. The message is one line; the exit code is 1."""
 
 
 def is_disk_error(error: Exception) -> bool:

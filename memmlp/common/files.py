@@ -29,10 +29,8 @@ def to_number(value: Any) -> Any:
 
 
 def make_json_safe(value: Any) -> Any:
-    """Return the value in a form that can be stored as JSON.
-
-    Tuples become lists, keys become strings, and NaN and infinities become strings.
-    """
+    """Return the value in a form that can be stored as JSON: tuples become lists, and keys, NaN and
+    infinities strings."""
     if isinstance(value, Mapping):
         return {str(key): make_json_safe(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -50,13 +48,8 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file for writing; it appears only once it is complete, even if the machine crashes.
-
-    The file is written under a temporary name, then synced and renamed.
-
-    Raises:
-        LeaseLost: if this process lost its lease of the file's folder (memmlp.common.lease).
-    """
+    """Open a file for writing under a temporary name; it is synced and renamed once it is complete, even if
+    the machine crashes. Raises LeaseLost if this process lost its lease of the file's folder."""
     unfinished = temporary_path(path)
     try:
         with naming_file(path), open(unfinished, "wb") as file:
@@ -103,10 +96,7 @@ def file_digest(path: Path) -> str:
 
 
 def digest(value: Any) -> str:
-    """Return the SHA-256 digest (hex) of a JSON value.
-
-    Other values are converted to text; convert a dataclass with `asdict` first.
-    """
+    """Return the SHA-256 digest (hex) of a JSON value; other values count as text."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
 
 

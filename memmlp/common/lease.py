@@ -108,12 +108,7 @@ class ChangeTimer:
         self.seen: dict[Hashable, tuple[object, float]] = {}
 
     def seconds_unchanged(self, key: Hashable, read: Callable[[], object]) -> float:
-        """Read a value, and return for how many seconds it has at least been unchanged; 0 at first.
-
-        Args:
-            key: the value's name.
-            read: a function that returns the value.
-        """
+        """Read a value, and return for how many seconds it has at least been unchanged; 0 at first."""
         before = self.clock()  # if this process is frozen while it reads, that time must not count
         value = read()
         last = self.seen.get(key)
@@ -129,14 +124,8 @@ _leases: dict[Path, Lease] = {}
 
 
 class Claim(NamedTuple):
-    """A claim on a folder, read from its file.
-
-    Attributes:
-        number: the claim's number.
-        free: whether the owner has released the folder.
-        text: the content of the claim's file.
-        touched: time of the last heartbeat, in nanoseconds of the file system's clock.
-    """
+    """A claim on a folder, read from its file: its number, whether the owner has released the folder, the
+    file's content, and the time of the last heartbeat, in nanoseconds of the file system's clock."""
 
     number: int
     free: bool
@@ -152,11 +141,8 @@ class Claim(NamedTuple):
         return None
 
     def can_be_taken_over(self, idle: float) -> bool | None:
-        """Return whether another process may claim the folder; None if it has to wait for LEASE.
-
-        Args:
-            idle: for how many seconds the claim has been unchanged.
-        """
+        """Return whether another process may claim the folder, which has been idle for these seconds; None if
+        it has to wait for LEASE."""
         alive = is_alive(self.owner) if self.owner else None
         if self.free or alive is False or idle > LEASE:
             return True
@@ -164,12 +150,7 @@ class Claim(NamedTuple):
 
 
 class Lock:
-    """The lock of a folder; a thread that holds it may lock it again.
-
-    Args:
-        folder: the folder with the claims' files.
-        name: the subfolder to lock; by default, `folder` itself is locked.
-    """
+    """The lock of a folder, or of its subfolder `name`; a thread that holds it may lock it again."""
 
     def __init__(self, folder: Path, name: str = ""):
         self.folder, self.target = folder, folder / name
@@ -178,15 +159,10 @@ class Lock:
 
     @contextlib.contextmanager
     def hold(self, report: Callable[[str], None] | None = None, wait: bool = True) -> Iterator[Lease | None]:
-        """Hold the lock during the context, and yield the lease; None if another process holds the lock.
-
-        If another process takes over the folder, any attempt of this process to publish a file there raises
-        LeaseLost.
-
-        Args:
-            report: gets a line if this process has to wait; by default, the line goes to stderr.
-            wait: whether to wait while another process holds the lock.
-        """
+        """Hold the lock during the context, and yield the lease; without `wait`, None if another process
+        holds the lock. If another process takes over the folder, any attempt of this process to publish a
+        file there raises LeaseLost. `report` gets a line if this process has to wait; by default, the line
+        goes to stderr."""
         key, thread = _resolve_folder(self.target), (os.getpid(), threading.get_ident())
         if key in _leases and _leases[key].thread == thread:
             yield _leases[key]
@@ -225,15 +201,12 @@ class Lock:
 
     @property
     def is_held(self) -> bool | None:
-        """Whether a live process holds the lock; False if its process died, None if the lock is free.
-
-        A process on another machine counts as dead after LEASE without a heartbeat.
-        """
+        """Whether a live process holds the lock; False if its process died, None if the lock is free. A
+        process on another machine counts as dead after LEASE without a heartbeat."""
         last, idle = self._read_last_claim_and_age()
         return None if last is None or last.free else not last.can_be_taken_over(idle)
 
     def _read_last_claim_and_age(self) -> tuple[Claim | None, float]:
-        """Return the last claim, and for how many seconds this process has seen it unchanged."""
         claims: list[Claim | None] = []
 
         def read() -> Claim | None:
@@ -244,7 +217,6 @@ class Lock:
         return claims[-1], idle
 
     def _read_last_claim(self) -> Claim | None:
-        """Return the last claim, which is the valid one; None if there is no claim."""
         while claims := self.list_claims():
             (number, owned), path = claims[-1]
             with (
@@ -296,13 +268,8 @@ class Lock:
 
 
 class Lease:
-    """This process' claim on a folder.
-
-    Attributes:
-        number: the claim's number, higher than all earlier numbers.
-        path: the claim's file.
-        lost: whether this process knows that another one has taken over the folder.
-    """
+    """This process' claim on a folder. `lost` is set once this process knows that another one has
+    taken over."""
 
     def __init__(self, lock: Lock, number: int, path: Path):
         self.lock, self.number, self.path, self.lost = lock, number, path, False
@@ -346,11 +313,8 @@ class Lease:
 
 
 def check_owner(path: Path) -> None:
-    """Raise LeaseLost if this process has lost its lease of the path's folder.
-
-    Call this before appending to a file or removing it. It can't detect a freeze between the check and the
-    write.
-    """
+    """Raise LeaseLost if this process has lost its lease of the path's folder. Call this before appending to
+    a file or removing it. It can't detect a freeze between the check and the write."""
     if lease := _find_lease(path):
         lease.check()
 
@@ -363,15 +327,8 @@ def temporary_path(path: Path) -> Path:
 
 
 def publish(unfinished: Path, path: Path) -> None:
-    """Move a finished file or folder to its final path.
-
-    Args:
-        unfinished: the path from `temporary_path`.
-        path: the final path.
-
-    Raises:
-        LeaseLost: if this process has lost its lease of the path's folder.
-    """
+    """Move a finished file or folder from its `temporary_path` to its final path. Raises LeaseLost if this
+    process has lost its lease of the path's folder."""
     check_owner(path)
     try:
         os.replace(unfinished, path)

@@ -1,8 +1,6 @@
-"""Downloads, checks and caches the npm packages that pages use; their versions are pinned.
-
-The registry is `NPM_CONFIG_REGISTRY`, or registry.npmjs.org by default.
-Tarballs are kept in the user's cache folder. They are read member by member, and never unpacked.
-"""
+"""Downloads, checks and caches the npm packages that pages use, with pinned versions. The registry is
+`NPM_CONFIG_REGISTRY`, or registry.npmjs.org by default. Tarballs are kept in the user's cache folder. They
+are read member by member, and never unpacked."""
 
 from __future__ import annotations
 
@@ -31,13 +29,8 @@ MAX_SIZE = 300_000_000  # bytes of a tarball
 
 @dataclass(frozen=True)
 class Package:
-    """An npm package with a pinned version.
-
-    Attributes:
-        name: the package's name, including its scope.
-        version: the pinned version.
-        integrity: the tarball's digest in npm's format: "sha512-" and the digest in base 64.
-    """
+    """An npm package with a pinned version, and the tarball's digest in npm's format ("sha512-" and
+    base 64)."""
 
     name: str
     version: str
@@ -79,12 +72,8 @@ IWER = Package(  # a headset in software, for tests
 
 
 def read_package_files(package: Package, names: Collection[str]) -> dict[str, bytes]:
-    """Return the content of files in a package, by file name, such as "dist/ort.min.mjs".
-
-    Raises:
-        InputError: if the package can't be downloaded.
-        KeyError: if the package does not have a file.
-    """
+    """Return the content of files in a package, by file name, such as "dist/ort.min.mjs". Raises InputError
+    if the package can't be downloaded, and KeyError if it does not have a file."""
     contents = {}
     with tarfile.open(fetch_tarball(package), "r:gz") as archive:
         for member in archive:
@@ -99,11 +88,8 @@ def read_package_files(package: Package, names: Collection[str]) -> dict[str, by
 
 
 def fetch_tarball(package: Package) -> Path:
-    """Return a package's tarball, downloading it if it is not in the cache; its digest is checked.
-
-    Raises:
-        InputError: if the tarball can't be downloaded, or does not have the pinned digest.
-    """
+    """Return a package's tarball, downloading it if it is not in the cache. Raises InputError if it can't be
+    downloaded, or does not have the pinned digest."""
     if (given := os.environ.get(FOLDER)) and (path := Path(given) / package.file).is_file():
         if _has_digest(package, path.read_bytes()):
             return path

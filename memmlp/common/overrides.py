@@ -12,14 +12,8 @@ SIGNS = "+~"
 
 @dataclass(frozen=True)
 class Override:
-    """An override [SIGNS]KEY[=VALUE] from a command line.
-
-    Attributes:
-        text: the whole override.
-        signs: "", "+", "++" or "~".
-        key: a dotted key, or a config group.
-        value: the text after the first "="; None for an override without one.
-    """
+    """An override [SIGNS]KEY[=VALUE] from a command line: the whole text, the signs ("", "+", "++" or "~"), a
+    dotted key or a config group, and the text after the first "=", None without one."""
 
     text: str
     signs: str

@@ -53,12 +53,8 @@ def find_content_type(name: str) -> str:
 
 
 def build_security_policy(index: str, *scripts: str) -> str:
-    """Return a page's Content-Security-Policy; it allows the page's own scripts and import map only.
-
-    Args:
-        index: the page's HTML, with an import map.
-        scripts: further allowed sources of scripts.
-    """
+    """Return a page's Content-Security-Policy; it allows only the page's own scripts, the import map in its
+    HTML `index`, and further sources of `scripts`."""
     inline = re.search(r'<script type="importmap">(.*?)</script>', index, re.DOTALL)
     assert inline is not None
     digest = base64.b64encode(hashlib.sha256(inline[1].encode()).digest()).decode()
@@ -70,15 +66,8 @@ def build_security_policy(index: str, *scripts: str) -> str:
 
 
 class AccessRules:
-    """The access rules of a server.
-
-    Args:
-        host: the address at which the server listens.
-        token: the token that requests need, except at the loopback address; None for a new random token.
-
-    Attributes:
-        token: the token; None at the loopback address.
-    """
+    """The access rules of a server that listens at `host`. Its `token` is None at the loopback address, else
+    the given one or a new random one."""
 
     def __init__(self, host: str, token: str | None = None):
         self.host = host
@@ -218,20 +207,10 @@ class PageHandler(BaseHTTPRequestHandler):
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves a page in background threads, inside a `with` block.
-
-    Args:
-        handler: the class that answers requests.
-        port: the port; 0 for any free port.
-        host: the address to serve at; at 127.0.0.1, only this machine can open the page.
-        token: the token that requests need at other addresses; None for a new random token.
-
-    Attributes:
-        headers: headers of every answer, in addition to the security headers.
-
-    Raises:
-        InputError: if the address does not belong to this machine, or the port is in use.
-    """
+    """Serves a page in background threads, inside a `with` block. `handler` is the class that answers
+    requests. Port 0 is any free port. At the host 127.0.0.1, only this machine can open the page; other
+    addresses need `token`, None for a new random one. `headers` come with every answer. Raises InputError if
+    the address does not belong to this machine, or the port is in use."""
 
     daemon_threads = True
     block_on_close = False
@@ -260,10 +239,8 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """The page's address, including the token if one is needed.
-
-        If the server listens at all addresses, this is the address for other machines.
-        """
+        """The page's address, with the token if one is needed; for a server at all addresses, that for other
+        machines."""
         name = find_own_address() if self.server_name == EVERYWHERE else self.server_name
         token = self.access.token
         return f"http://{name}:{self.server_port}/" + (f"?token={urllib.parse.quote(token)}" if token else "")

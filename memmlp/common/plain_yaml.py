@@ -9,11 +9,9 @@ import yaml
 
 
 class PlainYaml(yaml.SafeLoader):
-    """A safe YAML loader that rejects duplicate keys and reads scalars like Hydra's command line.
-
-    Numbers, true, false and null have types. Everything else is the text as written, such as off, 010, 12:30
-    and 1_000. Keys, and values of the keys in `TEXTS`, are always text. PyYAML's own rules are YAML 1.1's.
-    """
+    """A safe YAML loader that rejects duplicate keys and reads scalars like Hydra's command line. Numbers,
+    true, false and null have types. Everything else is the text as written, such as off, 010, 12:30 and
+    1_000. Keys, and values of the keys in `TEXTS`, are always text. PyYAML's own rules are YAML 1.1's."""
 
     TEXTS = ("control", "against")
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012

@@ -22,11 +22,8 @@ MIN_CORE_FRACTION = 0.9  # below this fraction of a core, other processes distur
 
 
 def collect_garbage_rarely() -> None:
-    """Make the garbage collector run rarely, and not when the process ends.
-
-    Call this at the start of a process. Importing torch creates hundreds of thousands of live objects.
-    Scanning them repeatedly takes a third of the time of a short command.
-    """
+    """Make the garbage collector run rarely, and not when the process ends. Importing torch creates hundreds
+    of thousands of live objects; scanning them takes a third of the time of a short command."""
     gc.set_threshold(*GC_THRESHOLDS)
     atexit.register(gc.freeze)
 
@@ -86,12 +83,9 @@ def treat_termination_as_interrupt() -> Iterator[None]:
 
 
 def build_import_variables() -> dict[str, str]:
-    """Return environment variables with which another Python process imports the same modules.
-
-    Without them, `python -m` searches the working folder first. It may contain another copy of the package.
-    The standard library and site-packages are left out, because a job on a cluster may start another
-    interpreter (`conda activate`).
-    """
+    """Return environment variables with which another Python process imports the same modules. Without them,
+    `python -m` searches the working folder first, which may contain another copy of the package. The standard
+    library and site-packages are left out, because a job on a cluster may start another interpreter."""
     library = sysconfig.get_path("stdlib")
     zipped = f"python{sys.version_info.major}{sys.version_info.minor}.zip"
     installed = (library, *site.getsitepackages(), site.getusersitepackages())
@@ -121,11 +115,8 @@ def pass_import_paths_to_children() -> Iterator[None]:
 
 
 class CoreUsageTimer:
-    """Measures the fraction of time in which the calling thread ran on a CPU core.
-
-    Other threads are not counted. Use it only where the calling thread does all the work, such as in a
-    single-threaded session of ONNX Runtime.
-    """
+    """Measures the fraction of time in which the calling thread ran on a CPU core. Use it only where this
+    thread does all the work, such as in a single-threaded session of ONNX Runtime."""
 
     def __init__(self) -> None:
         self._start, self._busy = time.perf_counter(), time.thread_time()

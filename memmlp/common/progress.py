@@ -64,15 +64,8 @@ def label_progress(name: str) -> Iterator[None]:
 
 
 class ProgressCounter:
-    """Counts the finished items of some work.
-
-    A terminal shows a bar. A listener (`send_announcements_to`) gets a line every INTERVAL seconds.
-
-    Args:
-        display: draws the bar.
-        row: the bar's row in the display.
-        unit: the unit of the count, such as frames.
-    """
+    """Counts the finished items of some work, in a bar at this row of the display. A listener
+    (`send_announcements_to`) gets a line every INTERVAL seconds."""
 
     def __init__(self, display: Progress, row: TaskID, unit: str = ""):
         self.display, self.row, self.unit = display, row, unit
@@ -107,14 +100,8 @@ def show_progress(
     description: str, total: float | None, done: int = 0, shown: bool = True, unit: str = ""
 ) -> Iterator[ProgressCounter]:
     """Show the progress of some work on stderr: description, bar, count, elapsed and remaining time, a note.
-
-    Args:
-        description: the name of the work.
-        total: the number of items; None if unknown.
-        done: the number of items that are already finished.
-        shown: whether this process shows the bar.
-        unit: the unit of the count, such as frames.
-    """
+    `total` is None if unknown; `done` items are already finished; `unit` is that of the count, such as
+    frames."""
     from rich import progress  # imported here, since printing help does not need it
 
     from memmlp.common.text_formats import make_console
@@ -141,14 +128,8 @@ def show_progress(
 def progress_bar(
     items: Iterable[T], description: str, total: int | None = None, unit: str = ""
 ) -> Iterator[T]:
-    """Yield the items while a progress bar counts them.
-
-    Args:
-        items: the items to iterate over.
-        description: the bar's label.
-        total: the number of items, if `items` has no length.
-        unit: the unit of the count, such as frames.
-    """
+    """Yield the items while a progress bar counts them. `total` is their number, if `items` has no length;
+    `unit` is that of the count, such as frames."""
     if total is None and isinstance(items, Sized):
         total = len(items)
     with show_progress(description, total, unit=unit) as count:

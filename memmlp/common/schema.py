@@ -1,7 +1,5 @@
-"""Parses JSON and YAML of unknown origin, and checks values against types.
-
-Such a file may be hostile, so its size, depth and aliases are bounded before its content is expanded.
-"""
+"""Parses JSON and YAML of unknown origin, and checks values against types. Such a file may be hostile, so its
+size, depth and aliases are bounded before its content is expanded."""
 
 from __future__ import annotations
 
@@ -51,12 +49,8 @@ def parse_yaml(text: str) -> Any:
 
 
 def check_plain(value: Any, depth: int = MAX_DEPTH) -> None:
-    """Raise ValueError unless a list or mapping is a tree of JSON values with finite 64-bit numbers.
-
-    Args:
-        value: the list or mapping.
-        depth: the maximum number of nested lists and mappings.
-    """
+    """Raise ValueError unless a list or mapping is a tree of JSON values with finite 64-bit numbers, at most
+    `depth` levels deep."""
     if not isinstance(value, dict | list) or not depth:
         raise ValueError(f"has a {type(value).__name__}" if depth else "nested too deeply")
     if len(value) > MAX_ITEMS:
@@ -81,13 +75,8 @@ def _get_fields(kind: Any) -> dict[str, Any]:
 
 
 def check_type(value: Any, kind: Any, key: str = "") -> None:
-    """Raise ValueError if a value does not have a type.
-
-    Args:
-        value: the value.
-        kind: a scalar, list[X], dict[str, X], X | Y, Literal, TypedDict, Any, or Annotated[X, PREDICATE].
-        key: the value's dotted key, for the message.
-    """
+    """Raise ValueError if the value of a dotted key does not have a type: a scalar, list[X], dict[str, X], X
+    | Y, Literal, TypedDict, Any, or Annotated[X, PREDICATE]."""
     origin, args = get_origin(kind), get_args(kind)
     if type(value) is kind or (origin in (Union, UnionType) and type(value) in args):
         return

@@ -21,12 +21,7 @@ PRECISIONS = ("fp32", "int8", "int8_blocks", "fp16")
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule for the values of a key.
-
-    Attributes:
-        words: the description of allowed values; messages put it behind "must be".
-        allows: a function that returns whether a value obeys the rule.
-    """
+    """A rule for the values of a key: `allows` checks a value; messages put `words` behind "must be"."""
 
     words: str
     allows: Callable[[Any], bool]
@@ -38,10 +33,8 @@ def one_of(*words: str) -> Rule:
 
 
 def within(low: float, high: float = math.inf, *words: str, strict: bool = False) -> Rule:
-    """Return the rule that a value must be a finite number within limits, or one of the words.
-
-    The limits themselves are allowed unless `strict`.
-    """
+    """Return the rule that a value must be a finite number within limits (excluded if `strict`), or one of
+    the words."""
 
     def allows(value: Any) -> bool:
         if not isinstance(value, int | float) or isinstance(value, bool):
@@ -160,14 +153,8 @@ def sized(tiny: Any, small: Any, paper: Any, width_fraction: float = 0) -> str:
 
 
 def tuned(lr: float, warmup: float = 0.05) -> dict[str, Any]:
-    """Return the recipe of a network with the learning rate that a search found at the size `small`.
-
-    Other sizes have `profile.lr`, without a warm-up.
-
-    Args:
-        lr: the learning rate.
-        warmup: the length of the warm-up as a fraction of the steps.
-    """
+    """Return the recipe of a network with the learning rate that a search found at the size `small`, and a
+    warm-up (fraction of the steps). Other sizes have `profile.lr`, without a warm-up."""
     return {"optim.lr": sized("${profile.lr}", lr, "${profile.lr}"), "optim.warmup": sized(0, warmup, 0)}
 
 

@@ -1,7 +1,5 @@
-r"""Texts of users as data in other formats: shell, Hydra, URLs, keys, LaTeX, Markdown, CSV, terminals.
-
-Each function returns a text that a reader of the format turns back into the given text.
-"""
+"""Texts of users as data in other formats: shell, Hydra, URLs, keys, LaTeX, Markdown, CSV, terminals. A
+reader of the format turns the result back into the given text."""
 
 from __future__ import annotations
 
@@ -76,13 +74,8 @@ def make_sqlite_url(path: Path) -> str:
 
 
 def make_key(text: str, allowed: str, max_length: int) -> str:
-    """Return a key of another program for a text; texts that must be changed get different keys.
-
-    Args:
-        text: the text.
-        allowed: the allowed characters, as the inside of a character class of a regular expression.
-        max_length: the maximum length.
-    """
+    """Return a key of another program for a text; texts that must be changed get different keys. `allowed` is
+    the inside of a character class of a regular expression."""
     key = re.sub(rf"[^{allowed}]|(?<=\.)\.|(?<=/)/|(?<![^/])\.(?![^/])|^/|/$", "_", text)
     if key == text and len(key) <= max_length:
         return key
@@ -90,10 +83,8 @@ def make_key(text: str, allowed: str, max_length: int) -> str:
 
 
 def escape_latex(text: str) -> str:
-    r"""Return a text for LaTeX, also at the start of a table's row, where [ and * belong to \\ and \midrule.
-
-    Ligatures are prevented. Line breaks become blanks.
-    """
+    """Return a text for LaTeX, also at the start of a table's row, where [ and * belong to \\ and \midrule.
+    Ligatures are prevented. Line breaks become blanks."""
     text = re.sub(r"([-',!?])(?=[-'`,])", "\\1\0", " ".join(text.split()))
     escaped = "".join(TEX_ESCAPES.get(letter, letter) for letter in text).replace("\0", "{}")
     return f"{{}}{escaped}" if escaped.startswith(("[", "*", "(")) else escaped

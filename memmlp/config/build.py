@@ -56,15 +56,9 @@ from memmlp.training.train_refiner import RefinerTraining
 
 
 def build_experiment(cfg: DictConfig, remote: bool = False) -> Experiment:
-    """Build the experiment of a checked config.
-
-    Args:
-        cfg: the config.
-        remote: whether this process does not train it, so the config's device may be missing here.
-
-    Raises:
-        InputError: if the config's device, or the code of a custom component, is missing.
-    """
+    """Build the experiment of a checked config. With `remote`, this process does not train it, so the
+    config's device may be missing here. Raises InputError if the device, or the code of a custom component,
+    is missing."""
     unrefined = None
     if cfg.refiner is not None:
         bare = cfg.copy()
@@ -94,14 +88,8 @@ def build_experiment(cfg: DictConfig, remote: bool = False) -> Experiment:
 
 
 def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Training, ...]:
-    """Build the trainings of the prerequisite runs that a checked config needs, in order.
-
-    The result is empty for a refiner, which needs only the run of its network.
-
-    Args:
-        cfg: the config.
-        config: the resolved config as plain dictionaries.
-    """
+    """Build the trainings of the prerequisite runs that a checked config (also given as plain dictionaries)
+    needs, in order; none for a refiner, which needs only the run of its network."""
     if cfg.refiner is not None:
         return ()
     if cfg.prerequisite is not None:
@@ -145,11 +133,8 @@ def build_loggers(cfg: DictConfig) -> Loggers:
 
 
 def build(cfg: DictConfig, slot: str) -> Any:
-    """Build the component in a slot of a checked config.
-
-    Raises:
-        InputError: if the component's class does not accept the keys.
-    """
+    """Build the component in a slot of a checked config. Raises InputError if its class does not accept the
+    keys."""
     component, keys = _read_component(cfg, slot)
     try:
         return component.build(keys)
@@ -214,15 +199,9 @@ def build_metrics(names: Iterable[str]) -> dict[str, UserMetric]:
 
 
 def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
-    """Return a function that builds the loss for a network's branches.
-
-    Mem-MLP's loss combines a weighting, a hand term and a custom term for the network's branches. A complete
-    loss ignores the branches.
-
-    Raises:
-        InputError: if a custom term is combined with a complete loss, or needs a branch that the predictor
-            does not have.
-    """
+    """Return a function that builds the loss for a network's branches. Mem-MLP's combines a weighting, a hand
+    term and a custom term for these branches; a complete loss ignores them. Raises InputError if a custom
+    term is combined with a complete loss, or needs a branch that the predictor does not have."""
     loss = build(cfg, "loss")
     if isinstance(loss, Loss):
         if cfg.term is not None:
@@ -258,19 +237,10 @@ def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
 
 
 def load_config(run: Run, overrides: Sequence[str] = (), outputs: Path | None = None) -> DictConfig:
-    """Return the typed and checked config of a finished run of a motion network.
-
-    A recorded config never decides where a command writes (`_use_outputs`).
-
-    Args:
-        run: the run.
-        overrides: overrides KEY=VALUE of its config.
-        outputs: the folder of runs and caches; by default, the folder that contains the run.
-
-    Raises:
-        InputError: for an unfinished run, a config that this version cannot read, an invalid override, or a
-            package with custom components that is not in use.
-    """
+    """Return the typed and checked config of a finished run of a motion network, with these overrides
+    KEY=VALUE. A recorded config never decides where a command writes: `outputs` is by default the folder that
+    contains the run. Raises InputError for an unfinished run, a config that this version cannot read, an
+    invalid override, or a package with custom components that is not in use."""
     check_trained(run)
     plugins.activate(plugins.find_named_packages(overrides))
     plugins.check_allowed(run.config, run.manifest.get("plugins") or {}, f"run {run.id}")
@@ -289,10 +259,8 @@ def load_config(run: Run, overrides: Sequence[str] = (), outputs: Path | None = 
 
 
 def _use_outputs(cfg: DictConfig, outputs: Path) -> None:
-    """Replace the recorded places to write to: outputs, synthetic motion, predictions and loggers.
-
-    Recorded motion below the recorded outputs is expected at the same place below `outputs`, if it is there.
-    """
+    """Replace the recorded places to write to: outputs, synthetic motion, predictions and loggers. Recorded
+    motion below the recorded outputs is expected at the same place below `outputs`, if it is there."""
     recorded, cfg.paths.outputs = cfg.paths.outputs, escape_interpolations(str(outputs))
     cfg.force, cfg.save_predictions, cfg.loggers = False, None, {}
 
@@ -333,15 +301,9 @@ SET_BY_MODELS = ("ema",)
 
 
 def make_readable_name(kind: str, config: Mapping[str, Any]) -> str:
-    """Return a readable name for a run.
-
-    It lists options of slots, and values of other keys, that differ from the defaults. Data, paths, loggers
-    and keys without an effect on the results are omitted.
-
-    Args:
-        kind: the kind of run (see `Identity`).
-        config: the run's resolved config.
-    """
+    """Return a readable name for a run of this kind (see `Identity`) and resolved config: the options of
+    slots, and values of other keys, that differ from the defaults. Data, paths, loggers and keys without an
+    effect on the results are omitted."""
     words = [] if kind == NETWORK else [describe_kind(kind)]
     try:
         words += _list_differences(config)
@@ -392,10 +354,8 @@ def _is_shipped(slot: str, option: str) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def _compose_default(overrides: tuple[str, ...]) -> dict[str, Any]:
-    """Return the config of `memmlp train` with these overrides, without groups that names omit.
-
-    Hydra's global state is restored afterwards.
-    """
+    """Return the config of `memmlp train` with these overrides, without groups that names omit. Hydra's
+    global state is restored afterwards."""
     register_components()
     hydra = GlobalHydra.instance()
     before, hydra.hydra = hydra.hydra, None

@@ -28,15 +28,9 @@ SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit, "pe
 
 
 def build_motion(cfg: DictConfig) -> MotionSource:
-    """Build the source of an experiment's motion.
-
-    The name of a synthetic folder contains the generator's settings and its component version above 1.
-    Therefore, different settings or generators use different folders.
-
-    Raises:
-        InputError: if a list of groups cannot be read, two folders have the same name, or the generator does
-            not exist.
-    """
+    """Build the source of an experiment's motion. The name of a synthetic folder contains the generator's
+    settings and its component version above 1, so different ones use different folders. Raises InputError if
+    a list of groups cannot be read, two folders have the same name, or the generator does not exist."""
     data = cfg.data
     root, split = _build_clip_request(data)
     generate: Callable[[Path], object] | None = None
@@ -114,22 +108,16 @@ def _build_source_split(split: SeededSplit, name: str, source: DictConfig) -> Se
 
 
 def build_request(cfg: DictConfig) -> RunRequest:
-    """Build the run request of a checked config.
-
-    Raises:
-        InputError: if a package of the config is not in use, or the motion source cannot be built.
-    """
+    """Build the run request of a checked config. Raises InputError if a package of the config is not in use,
+    or the motion source cannot be built."""
     config = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
     config["plugins"] = plugins.find_used_packages(config)
     return RunRequest(config, build_motion(cfg))
 
 
 def build_requests(cfg: DictConfig, seeds: Sequence[int]) -> Iterator[RunRequest]:
-    """Yield the run request of a checked config for each seed.
-
-    Resolving a config is slow. Therefore only the seed, and keys that refer to it, are resolved again for
-    later seeds.
-    """
+    """Yield the run request of a checked config for each seed. Resolving is slow, so only the seed, and keys
+    that refer to it, are resolved again for later seeds."""
     cfg.seed = seeds[0]
     first = build_request(cfg)
     yield first

@@ -27,11 +27,8 @@ from memmlp.config.schema import Config
 
 
 def check(cfg: DictConfig) -> None:
-    """Check a composed config.
-
-    Raises:
-        InputError: for a missing or unknown key, an invalid value, or values that cannot be combined.
-    """
+    """Check a composed config. Raises InputError for a missing or unknown key, an invalid value, or values
+    that cannot be combined."""
     if OmegaConf.get_type(cfg) is not Config:
         raise InputError("config: must start from /schema/config, as conf/train.yaml does")
     for name, value, rule in _list_values(cfg, ""):
@@ -46,11 +43,8 @@ def check(cfg: DictConfig) -> None:
 
 
 def _list_values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the dotted name, value and rule of each key in a typed node and its groups.
-
-    Raises:
-        InputError: for a key that is not in the schema.
-    """
+    """Yield the dotted name, value and rule of each key in a typed node and its groups. Raises InputError for
+    a key that is not in the schema."""
     schema: Any = OmegaConf.get_type(node)
     if not dataclasses.is_dataclass(schema):  # a dictionary of groups, or of values
         for name in map(str, node):

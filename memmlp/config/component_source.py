@@ -32,10 +32,8 @@ def is_group(path: str) -> bool:
 
 
 class ComponentSource(ConfigSource):
-    """Provides GROUP/NAME for each component, GROUP/default for groups with one option, and schema/NAME.
-
-    An option is created only when Hydra loads it, so other components are not read.
-    """
+    """Provides GROUP/NAME for each component, GROUP/default for groups with one option, and schema/NAME. An
+    option is created only when Hydra loads it, so other components are not read."""
 
     @staticmethod
     def scheme() -> str:

@@ -56,11 +56,8 @@ VALUES = {
 
 
 def parse_hydra_arguments(argv: Sequence[str]) -> argparse.Namespace:
-    """Parse Hydra's command line, with flags and overrides in any order, and activate its plugins.
-
-    Raises:
-        InputError: for an unknown flag, or a plugin that cannot be used.
-    """
+    """Parse Hydra's command line, with flags and overrides in any order, and activate its plugins. Raises
+    InputError for an unknown flag, or a plugin that cannot be used."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.error = _raise_input_error  # type: ignore[method-assign]
     for flag, short in SWITCHES.items():
@@ -106,27 +103,16 @@ def compose_config(overrides: Sequence[str]) -> DictConfig:
 
 
 def compose_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
-    """Compose another config than `train`, and return it as plain dictionaries. It is not checked.
-
-    Args:
-        name: the config's name.
-        overrides: the command line's overrides.
-        folder: a folder with custom configs, searched first.
-    """
+    """Compose another config than `train`, also from a `folder` of custom configs, which is searched first,
+    and return it as plain dictionaries. It is not checked."""
     args = parse_hydra_arguments([*(["--config-dir", str(folder)] if folder else []), *overrides])
     with _initialize_hydra(args), _convert_errors(overrides):
         return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
 
 
 def find_experiment_keys(options: Sequence[str], overrides: Sequence[str] = ()) -> set[str]:
-    """Return the groups and dotted keys that options of the group `experiment` set.
-
-    Other experiments in an option's defaults list are included.
-
-    Args:
-        options: the options; unknown options are ignored.
-        overrides: further overrides; only `hydra.searchpath` has an effect.
-    """
+    """Return the groups and dotted keys that options of the group `experiment`, and those in their defaults
+    lists, set. Unknown options are ignored. Of `overrides`, only `hydra.searchpath` has an effect."""
     folders = [
         find_packaged_folder("conf"),
         *(folder for _, folder in plugins.list_config_folders()),
@@ -172,7 +158,6 @@ def compose_jobs(args: argparse.Namespace) -> list[DictConfig]:
 
 
 def _check_first_key_parts(args: argparse.Namespace) -> None:
-    """Raise InputError for a key with an unknown first part, before the slow composition."""
     if args.config_name or args.config_path:
         return
     keys = [spec.name for spec in dataclasses.fields(Config)]
@@ -183,12 +168,9 @@ def _check_first_key_parts(args: argparse.Namespace) -> None:
 
 
 def _compose_job(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
-    """Compose a job's config. The result is identical to Hydra's.
-
-    Group options are composed only once for all jobs, because this takes 90 % of the time, and a sweep's
-    configs often differ only in values. With custom config folders, Hydra composes each config, because the
-    files may change.
-    """
+    """Compose a job's config; the result is identical to Hydra's. Group options are composed only once for
+    all jobs, because this takes 90 % of the time, and a sweep's configs often differ only in values. With
+    custom config folders, Hydra composes each config, because the files may change."""
     parsed = OverridesParser.create().parse_overrides(overrides)
     options = [
         override
@@ -226,14 +208,9 @@ def _compose_options(*options: str) -> bytes:
 
 
 def _compose_components(options: Sequence[str]) -> DictConfig | None:
-    """Insert components into a config that Hydra composed with the other options.
-
-    Hydra needs 0.2 s for each composition; this function needs 0.02 s. A component sets its own slot. A model
-    may also set options of other slots, and keys.
-
-    Returns:
-        The config that Hydra would compose; None if only Hydra can combine the options.
-    """
+    """Insert components into a config that Hydra composed with the other options: 0.02 instead of 0.2 s. A
+    component sets its own slot. A model may also set options of other slots, and keys. The result is None if
+    only Hydra can combine the options."""
     chosen = select_last_by_key(options)
     special = any(override.signs or len(override.options) != 1 for override in chosen.values())
     if special or EXPERIMENT in chosen:
@@ -276,10 +253,8 @@ def _make_node(slot: str, name: str) -> DictConfig | None:
 
 
 def _check_effects(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Raise InputError for overrides without an effect.
-
-    These are a plugin in a config file, and a split fraction if each source sets its own fraction.
-    """
+    """Raise InputError for overrides without an effect: a plugin in a config file, and a split fraction if
+    each source sets its own."""
     for name in cfg.plugins:
         if name not in plugins.list_active():
             raise InputError(
@@ -299,10 +274,8 @@ def _check_effects(cfg: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _check_texts(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Raise InputError for a text that Hydra would change, because it reads the text as a number or bool.
-
-    For example, a folder 2024_11 would become 202411, and 1e3 would become 1000.0.
-    """
+    """Raise InputError for a text that Hydra would change, because it reads the text as a number or bool. For
+    example, a folder 2024_11 would become 202411, and 1e3 would become 1000.0."""
     for parsed in OverridesParser.create().parse_overrides(list(overrides)):
         value, kept = parsed.value(), OmegaConf.select(cfg, parsed.key_or_group)
         texts = list(kept) if OmegaConf.is_list(kept) else [kept]
@@ -357,7 +330,6 @@ def format_help(args: argparse.Namespace) -> str:
 
 @contextmanager
 def _initialize_hydra(args: argparse.Namespace) -> Iterator[None]:
-    """Initialise Hydra with the search path of the arguments, within the context."""
     _check_hidden(args)
     main = _find_folder(args.config_path or find_packaged_folder("conf"), "--config-path")
     folder = _find_folder(args.config_dir, "--config-dir") if args.config_dir else None
@@ -369,10 +341,8 @@ def _initialize_hydra(args: argparse.Namespace) -> Iterator[None]:
 
 
 def _check_hidden(args: argparse.Namespace) -> None:
-    """Raise InputError for a custom config file that Hydra ignores.
-
-    Hydra ignores it if a component, or a file in an earlier folder, has its name.
-    """
+    """Raise InputError for a custom config file that Hydra ignores, because a component, or a file in an
+    earlier folder, has its name."""
     main = _find_folder(args.config_path or find_packaged_folder("conf"), "--config-path")
     before = [
         main,
@@ -405,12 +375,8 @@ def _find_folder(name: str | Path, option: str) -> Path:
 
 
 def _list_jobs(args: argparse.Namespace) -> list[list[str]]:
-    """Return the overrides of each job; there is one job without a multirun.
-
-    Raises:
-        InputError: for an override that cannot be parsed, or a second `experiment=` override, which would
-            replace the first one.
-    """
+    """Return the overrides of each job; there is one job without a multirun. Raises InputError for an
+    override that cannot be parsed, or a second `experiment=`, which would replace the first one."""
     with _convert_errors(args.overrides):
         parsed = OverridesParser.create().parse_overrides(args.overrides)
         chosen = list(dict.fromkeys(str(one.input_line) for one in parsed if one.key_or_group == EXPERIMENT))

@@ -1,7 +1,4 @@
-"""Makes the plan of a sweep: composes and checks each variant's config, and computes the ids of its runs.
-
-The module is in memmlp.config because only this package composes configs.
-"""
+"""Makes the plan of a sweep: composes and checks each variant's config, and computes the ids of its runs."""
 
 from __future__ import annotations
 
@@ -23,15 +20,9 @@ if TYPE_CHECKING:
 
 
 def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
-    """Load a sweep, and activate the plugins that its base or the overrides name.
-
-    Args:
-        name: a file's path, a shipped sweep's name, or a table's number.
-        overrides: the command line's overrides (see `Sweep.with_overrides`).
-
-    Raises:
-        InputError: if the sweep does not exist, or its file is invalid.
-    """
+    """Load a sweep (a file's path, a shipped sweep's name, or a table's number), and activate the plugins
+    that its base or the overrides (see `Sweep.with_overrides`) name. Raises InputError if it does not exist,
+    or is invalid."""
     activate(find_named_packages(overrides))
     sweep = load_sweep(
         _find_sweep_file(name), lambda base: activate(find_named_packages(base))
@@ -42,14 +33,10 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
 
 
 def check_preset(sweep: Sweep, variant: Variant) -> None:
-    """Check that other overrides do not conflict with a variant's `experiment=NAME`.
-
-    In Hydra, an override of a group or key has priority over an experiment, and the last experiment replaces
-    earlier ones. Without this check, an override of the base could silently undo a part of the variant.
-
-    Raises:
-        InputError: for a conflict; the message names the sweep, the variant and both overrides.
-    """
+    """Check that other overrides do not conflict with a variant's `experiment=NAME`. In Hydra, an override of
+    a group or key has priority over an experiment, and the last experiment replaces earlier ones. So an
+    override of the base could silently undo a part of the variant. Raises InputError for a conflict; the
+    message names the sweep, the variant and both overrides."""
     from memmlp.config.compose import EXPERIMENT, find_experiment_keys
 
     variant_words = {parse_key(word): word for word in variant.overrides or ()}
@@ -71,7 +58,6 @@ def check_preset(sweep: Sweep, variant: Variant) -> None:
 
 
 def _find_sweep_file(name: str) -> Path:
-    """Return the path of a sweep's file. Raises InputError for an unknown name."""
     if is_path(name):
         return Path(name)
     folder = find_packaged_folder("sweeps")
@@ -94,10 +80,8 @@ def is_path(name: str) -> bool:
 
 
 def get_sweep_folder(sweep: Sweep, outputs: Path) -> Path:
-    """Return the folder of a sweep's plan, seed rounds and logs.
-
-    It depends on the overrides of the command line, but not on their order.
-    """
+    """Return the folder of a sweep's plan, seed rounds and logs. It depends on the overrides of the command
+    line, but not on their order."""
     if not sweep.command_line:
         return outputs / "sweeps" / sweep.name
     ordered = sorted(sweep.command_line, key=parse_key)
@@ -105,17 +89,10 @@ def get_sweep_folder(sweep: Sweep, outputs: Path) -> Path:
 
 
 def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-    """Make the plan of a sweep. With `prepare`, also write it into the sweep's folder.
-
-    Args:
-        sweep: the sweep with the command line's overrides.
-        outputs: the folder of runs and caches.
-        prepare: whether to prepare missing data. Otherwise, entries with unprepared data are omitted, because
-            a run's id depends on its data.
-
-    Raises:
-        InputError: for an invalid config; the message names the variant and the key.
-    """
+    """Make the plan of a sweep with the command line's overrides. With `prepare`, also write it into the
+    sweep's folder, and prepare missing data. Otherwise, entries with unprepared data are omitted, because a
+    run's id depends on its data. Raises InputError for an invalid config; the message names the variant and
+    the key."""
     planned: list[tuple[Entry, list[RunTask]]] = []
     data: dict[str, str | None] = {}
     for variant in sweep.list_runnable():
@@ -136,7 +113,6 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
 
 
 def _build_requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[tuple[int, RunRequest]]:
-    """Yield each seed of a variant with its checked request."""
     from memmlp.config.build_request import build_requests
     from memmlp.config.compose import compose_config
 
@@ -152,12 +128,8 @@ def _build_requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[t
 
 
 def make_tasks(request: RunRequest, data: str) -> list[RunTask]:
-    """Return the tasks of a request: its prerequisite runs in order, then its own run.
-
-    Args:
-        request: the request.
-        data: the digest of the prepared data.
-    """
+    """Return the tasks of a request for prepared data with this digest: its prerequisite runs in order, then
+    its own run."""
     from memmlp.training.request import remove_refiner
 
     bare = remove_refiner(request.config) if request.config["refiner"] is not None else request.config
@@ -170,11 +142,8 @@ def make_tasks(request: RunRequest, data: str) -> list[RunTask]:
 
 
 def _find_data_digest(request: RunRequest, prepare: bool, digests: dict[str, str | None]) -> str | None:
-    """Return the digest of a request's prepared data. Digests are cached in `known` by data config.
-
-    Returns:
-        None if the data is not prepared.
-    """
+    """Return the digest of a request's prepared data, or None. Digests are cached in `known` by
+    data config."""
     key = digest([request.config["data"], request.config["paths"]])
     if key not in digests:
         digests[key] = request.motion.prepare().digest if prepare else request.motion.find_digest()

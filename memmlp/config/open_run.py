@@ -1,7 +1,4 @@
-"""Opens finished runs with their experiments and data, for evaluation, export and live use.
-
-The module is in memmlp.config because only this package builds experiments from configs.
-"""
+"""Opens finished runs with their experiments and data, for evaluation, export and live use."""
 
 from __future__ import annotations
 
@@ -46,18 +43,9 @@ class OpenedRun(NamedTuple):
 
 
 def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
-    """Open a finished run.
-
-    Args:
-        outputs: the folder of runs and caches.
-        name: the run's id, the beginning of one, or the run's folder.
-        device_name: the device to compute on: "auto", "cpu", "cuda", "cuda:INDEX" or "mps".
-        overrides: overrides KEY=VALUE of the evaluation and the export.
-
-    Raises:
-        InputError: if the run does not exist, an override would change its training or have no effect, or its
-            data has changed since the training.
-    """
+    """Open a finished run in `outputs`, given its id, the beginning of one, or its folder, with overrides of
+    the evaluation and the export. Raises InputError if the run does not exist, an override would change its
+    training or have no effect, or its data has changed since the training."""
     run = find_run(outputs, name)
     experiment = build_run_experiment(run, device_name, overrides, outputs)
     return OpenedRun(run, experiment, load_run_data(run, experiment))
@@ -82,10 +70,8 @@ def load_run_data(run: Run, experiment: Experiment) -> PreparedMotion:
 def build_run_experiment(
     run: Run, device_name: str = "cpu", overrides: Sequence[str] = (), outputs: Path | None = None
 ) -> Experiment:
-    """Return the experiment of a finished run, without its data. Raises InputError like `open_run`.
-
-    By default, caches are in the outputs folder that contains the run.
-    """
+    """Return the experiment of a finished run, without its data. By default, caches are in the outputs folder
+    that contains the run. Raises InputError like `open_run`."""
     cfg = load_config(run, overrides, outputs)
     experiment = replace(build_experiment(cfg, remote=True), device=choose_device(device_name))
     if select_training_config(run.config) != select_training_config(experiment.config):
@@ -110,16 +96,8 @@ def find_clip(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:
 
 
 def find_clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
-    """Return the index of a test clip.
-
-    Args:
-        test: the test clips.
-        name: the clip's name.
-        key: the option or argument with the name, used in the error message.
-
-    Raises:
-        InputError: for an unknown name; the message lists the names.
-    """
+    """Return the index of a test clip. Raises InputError for an unknown name; the message begins with the
+    option or argument `key`, and lists the names."""
     if name not in test.names:
         raise InputError(f"{key} {name}: must be one of the run's test clips ({', '.join(test.names)})")
     return test.names.index(name)

@@ -46,11 +46,8 @@ _own: ContextVar[Path | None] = ContextVar("config_dir", default=None)
 
 
 def activate(names: Iterable[str] = ()) -> None:
-    """Activate packages: the named ones, and packages from the environment and from entry points.
-
-    Raises:
-        InputError: for a package that does not exist or has an invalid declaration.
-    """
+    """Activate packages: the named ones, and packages from the environment and from entry points. Raises
+    InputError for a package that does not exist or has an invalid declaration."""
     for name in (*list_installed(), *split_names(os.environ.get(VARIABLE, "")), *names):
         if name not in _active:
             _use_package(name)
@@ -183,15 +180,8 @@ def find_used_packages(config: Mapping[str, Any]) -> list[str]:
 
 
 def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where: str) -> None:
-    """Check that the packages of a recorded config are in use.
-
-    Args:
-        config: the config.
-        recorded: the recorded package facts of the run, such as the version, by package name.
-        where: the owner of the config, such as "run ID", for the error message.
-
-    Raises:
-        InputError: for a package that is missing or not in use.
+    """Check that the packages of a config are in use, given their recorded facts. `where` is the owner of the
+    config, such as "run ID", for the message. Raises InputError for a package that is missing or not in use.
     """
     for name in config.get(KEY) or ():
         if name not in _active:
@@ -218,24 +208,16 @@ DEFAULT_GROUPING = "cmu"  # the grouping of data=mocap
 
 
 def find_packaged_folder(name: str) -> Path:
-    """Return the shipped folder `conf` or `sweeps`.
-
-    In a checkout, it is beside the package folder. In an installation, it is `_conf` or `_sweeps` inside the
-    package folder.
-    """
+    """Return the shipped folder `conf` or `sweeps`: beside the package in a checkout, else `_conf` or
+    `_sweeps` in it."""
     package = Path(memmlp.__file__).resolve().parent
     installed = package / f"_{name}"
     return installed if installed.is_dir() else package.parent / name
 
 
 def choose_grouping(names: Collection[str]) -> str | None:
-    """Return the shipped grouping that these clips need in place of DEFAULT_GROUPING.
-
-    Return None if the default fits, or if no grouping fits.
-
-    Args:
-        names: paths of clips relative to their folder, without `.npz`.
-    """
+    """Return the shipped grouping that these clips (paths without `.npz`) need in place of DEFAULT_GROUPING;
+    None if the default fits, or if no grouping fits."""
     fitting = {
         path.stem
         for path in (find_packaged_folder("conf") / "data" / "grouping").glob("*.yaml")

@@ -319,13 +319,9 @@ ONLY = {
 
 
 def restore_config(config: Mapping[str, Any]) -> DictConfig:
-    """Convert a run's recorded config to a typed config.
-
-    Raises:
-        InputError: for a component that no package in use declares.
-        OmegaConfBaseException, KeyError, TypeError, ValueError: if the config does not match this version's
-            schema.
-    """
+    """Convert a run's recorded config to a typed config. Raises InputError for a component that no package in
+    use declares, and OmegaConfBaseException, KeyError, TypeError or ValueError if it does not match this
+    version's schema."""
     cfg = OmegaConf.structured(Config)
     for key, content in escape_interpolations(config).items():
         if not isinstance(content, Mapping):

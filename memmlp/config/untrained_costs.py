@@ -20,16 +20,10 @@ from memmlp.sweep.definition import COSTS, SIZES, Sweep
 def measure_untrained_variants(
     sweep: Sweep, runs: Mapping[str, RunsBySeed]
 ) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
-    """Measure an untrained network for each variant of a sweep without a finished run.
-
-    Times are measured only if the sweep's metrics include a time.
-
-    Returns:
-        The runs by variant and seed, with the untrained networks added, and flags that name these variants.
-
-    Raises:
-        InputError: if the sweep's metrics include errors (see `check_costs`).
-    """
+    """Measure an untrained network for each variant of a sweep without a finished run; times only if the
+    sweep's metrics include one. Return the runs by variant and seed, with the untrained networks added, and
+    flags that name these variants. Raises InputError if the sweep's metrics include errors (see
+    `check_costs`)."""
     check_costs(sweep)
     timed = not set(sweep.metrics) <= set(SIZES)
     without = [variant for variant in sweep.list_runnable() if not runs[variant.label]]
@@ -56,12 +50,8 @@ def check_costs(sweep: Sweep) -> None:
 
 
 def measure_costs(overrides: tuple[str, ...], timed: bool) -> MeasuredRun:
-    """Measure a network with random weights, and the ONNX file of its live step.
-
-    Args:
-        overrides: the overrides that configure the network.
-        timed: whether to measure times in addition to sizes.
-    """
+    """Measure a network with random weights, and the ONNX file of its live step; its times only if
+    `timed`."""
     from memmlp.deploy.export import export  # slow to import
     from memmlp.deploy.latency import measure_size
     from memmlp.live.pose_latency import measure_pose_times

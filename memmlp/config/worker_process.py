@@ -1,7 +1,4 @@
-"""A worker's process: for each task of a plan, it builds the experiment and finishes the run.
-
-The module is in memmlp.config because only this package builds experiments from configs.
-"""
+"""A worker's process: for each task of a plan, it builds the experiment and finishes the run."""
 
 from __future__ import annotations
 
@@ -15,19 +12,11 @@ from memmlp.training.request import RunRequest
 
 
 def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | None:
-    """Perform the tasks of the plan in a file.
-
-    Args:
-        path: the plan's file.
-        threads: the number of torch's threads if the config does not set it; 0: torch's default.
-        controller: the file of the controller's `Presence`; the worker ends with the controller. None for a
-            worker on another machine, which finishes a closed plan. It leaves an open plan when the
-            controller no longer touches the plan's file.
-        gpu: whether the worker needs a GPU.
-
-    Returns:
-        A line that explains why the worker has no GPU and did nothing; else None.
-    """
+    """Perform the tasks of the plan in a file. `threads` is the number of torch's threads if the config does
+    not set it; 0 for torch's default. `controller` is the file of the controller's `Presence`; the worker
+    ends with it. A worker without it, on another machine, finishes a closed plan, and leaves an open plan
+    when the controller no longer touches the plan's file. Return a line that explains why a worker that needs
+    a `gpu` has none and did nothing; else None."""
     if gpu and (line := explain_missing_gpu()):
         return line
     should_continue = (
@@ -45,18 +34,8 @@ def explain_missing_gpu() -> str | None:
 
 
 def perform_task(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
-    """Finish a task's run.
-
-    Args:
-        path: the plan's file, which is read repeatedly to find out whether the run was cancelled.
-        threads: the number of torch's threads if the config does not set it; 0: torch's default.
-        plan: the plan.
-        task: the task.
-
-    Raises:
-        Cancelled: if the plan cancels the run.
-        InputError: if the data or the code has changed since the plan was made.
-    """
+    """Finish a task's run; `threads` as in `work`. The plan's file is read repeatedly. Raises Cancelled if it
+    cancels the run, and InputError if the data or the code has changed since the plan was made."""
     from omegaconf import OmegaConf
 
     from memmlp.common.text_formats import escape_interpolations

@@ -62,11 +62,8 @@ NAMES = (*map(str, range(1, len(PLACES))), "head")
 
 
 class Output(Protocol):
-    """A receiver of frames. It never waits: it processes a frame immediately, or drops it.
-
-    Attributes:
-        name: the description of the output.
-    """
+    """A receiver of frames, described by `name`. It never waits: it processes a frame immediately, or drops
+    it."""
 
     name: str
 
@@ -78,12 +75,7 @@ class Output(Protocol):
 
 
 class Outputs:
-    """Several outputs. If an output fails, it is reported once, and the next frame is tried again.
-
-    Args:
-        outputs: the outputs.
-        report: gets a line about each failing output.
-    """
+    """Several outputs. A failing output is reported once, and the next frame is tried again."""
 
     def __init__(self, outputs: Sequence[Output], report: Callable[[str], None]):
         self.outputs, self.report = outputs, report
@@ -126,16 +118,8 @@ def encode_osc(messages: Iterable[tuple[str, str, Iterable[Any]]]) -> bytes:
 
 
 class Receiver:
-    """The address of a program that receives datagrams. The program does not have to run.
-
-    Args:
-        host: the program's host name or address.
-        port: its UDP port.
-        key: the command-line option with the address, for error messages.
-
-    Raises:
-        InputError: for an unknown host name.
-    """
+    """The UDP address of a program that receives datagrams and need not run. `key` is the command-line option
+    with the address, for messages. Raises InputError for an unknown host name."""
 
     def __init__(self, host: str, port: int, key: str):
         try:
@@ -152,10 +136,8 @@ class Receiver:
         return f"{self.address[0]}:{self.address[1]}"
 
     def send(self, datagram: bytes) -> None:
-        """Send a datagram, or drop it if the network is busy.
-
-        Raises OSError if the address cannot be reached.
-        """
+        """Send a datagram, or drop it if the network is busy. Raises OSError if the address cannot be
+        reached."""
         try:
             self.socket.sendto(datagram, self.address)
         except OSError as error:
@@ -212,10 +194,8 @@ class VRChat:
 
 
 def place_trackers(frame: BodyFrame) -> np.ndarray:
-    """Return positions (metres) and Euler angles (degrees) of eight trackers and the head.
-
-    The shape is (9, 2, 3), in Unity's axes.
-    """
+    """Return positions (metres) and Euler angles (degrees) of eight trackers and the head (9, 2, 3), in
+    Unity's axes."""
     turned = np.array(frame.local, np.float64)
     for joint in range(1, N_JOINTS):
         turned[joint] = turned[PARENTS[joint]] @ turned[joint]
@@ -234,17 +214,10 @@ def compute_euler_angles(rotations: np.ndarray) -> np.ndarray:
 
 
 class Recorder:
-    """An output that stores frames, and writes files of the user's motion on close.
-
-    Args:
-        paths: the files to write; the suffixes determine the formats.
-        rest: rest joints of the network's body (22, 3), metres, SMPL's body frame.
-        fps: the network's frames per second.
-        report: gets a line about each written file and its breaks.
-
-    Raises:
-        InputError: for an unknown suffix, an existing file, or a folder that cannot be written.
-    """
+    """An output that stores frames of the network's `fps` and body (rest joints (22, 3), metres, SMPL's body
+    frame), and on close writes files of the user's motion in the formats of their suffixes. `report` gets a
+    line about each file. Raises InputError for an unknown suffix, an existing file, or a folder that cannot
+    be written."""
 
     def __init__(self, paths: Sequence[Path], rest: np.ndarray, fps: float, report: Callable[[str], None]):
         for path in paths:
@@ -282,11 +255,8 @@ class Recorder:
         self.rows.append(np.concatenate([Rotation.from_matrix(local).as_rotvec().ravel(), root]).astype("f4"))
 
     def close(self) -> None:
-        """Write the files.
-
-        Raises:
-            InputError: if a file cannot be written. The other files are still written.
-        """
+        """Write the files. Raises InputError if a file cannot be written; the other files are still
+        written."""
         if not self.rows:
             self.report("recording: no frame was received, so no file is written")
             return

@@ -19,13 +19,10 @@ LEAST = 200  # minimum number of timed samples
 
 
 def measure_pose_times(path: Path, steps: int) -> dict[str, float]:
-    """Time end-to-end poses of an exported network on one thread: median and 95th percentile, milliseconds.
-
-    A pose is one call of `Stream.step`: features, conversions, forward kinematics and the network's step.
-    Unlike `measure_step_times`, this does not run a yardstick between the poses. So a small network stays in
-    the caches, and its pose may be faster than its step in `measure_step_times`. `pose_core_share` is the
-    fraction of the time in which the thread ran on a core.
-    """
+    """Time end-to-end poses of an exported network on one thread: median and 95th percentile, milliseconds. A
+    pose is one call of `Stream.step`: features, conversions, forward kinematics and the network's step.
+    Unlike `measure_step_times`, this runs no yardstick between the poses, so a small network stays in the
+    caches. `pose_core_share` is the fraction of the time in which the thread ran on a core."""
     stream, clock = Stream(path), CoreUsageTimer()
     seconds = time_poses(stream, WARM_UP + max(steps, LEAST))[WARM_UP:]
     return {
@@ -36,10 +33,8 @@ def measure_pose_times(path: Path, steps: int) -> dict[str, float]:
 
 
 def time_poses_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, RoundTimes]:
-    """Time end-to-end poses of exported networks on one thread. Each round times all files.
-
-    The first poses of a round are not counted.
-    """
+    """Time end-to-end poses of exported networks on one thread. Each round times all files, without its first
+    poses."""
     streams = {key: Stream(path) for key, path in paths.items()}
     return time_in_rounds(paths, rounds, lambda key: time_poses(streams[key], SETTLING + steps)[SETTLING:])
 

@@ -1,7 +1,5 @@
 """Rotations and forward kinematics on NumPy arrays, one frame at a time. Quaternions are x, y, z, w.
-
-`memmlp.motion.geometry` has the same functions for torch tensors. A live stream does not import torch.
-"""
+`memmlp.motion.geometry` has the same functions for torch tensors, which a live stream does not import."""
 
 from __future__ import annotations
 
@@ -31,10 +29,8 @@ def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
 
 def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
     """Convert matrices (n, 3, 3) to unit quaternions (n, 4), xyzw, w not negative; accurate at every angle.
-
-    Each row of the quaternion's outer product with itself is the quaternion, scaled by one component. The
-    row of the largest component is well conditioned.
-    """
+    Each row of the quaternion's outer product with itself is the quaternion, scaled by one component. The row
+    of the largest component is well conditioned."""
     outer = (matrix.reshape(-1, 9) @ _MATRIX.T + _IDENTITY).reshape(-1, 4, 4)
     pivot = np.einsum("nii->ni", outer).argmax(1)
     quaternion = outer[np.arange(len(outer)), pivot]
@@ -55,9 +51,7 @@ def rotate_by_fraction(matrix: np.ndarray, fraction: np.ndarray | float) -> np.n
 
 def slerp(a: np.ndarray, b: np.ndarray, weight: float) -> np.ndarray:
     """Interpolate between rotations (n, 3, 3) along the shortest path from a (weight 0) to b (weight 1).
-
-    Weights above 1 extrapolate.
-    """
+    Weights above 1 extrapolate."""
     return a @ rotate_by_fraction(a.swapaxes(-1, -2) @ b, weight)
 
 
@@ -110,11 +104,8 @@ class BodyTree:
         self._transforms[:count, :3, 3] = self.bone_offsets
 
     def compute_positions(self, local: np.ndarray) -> np.ndarray:
-        """Return the joint positions (J, 3), metres, relative to the head.
-
-        Args:
-            local: local rotations (J, 3, 3); the root rotation is global.
-        """
+        """Return the joint positions (J, 3), metres, relative to the head, for local rotations (J, 3, 3); the
+        root's is global."""
         transforms = self._transforms
         transforms[:-1, :3, :3] = local
         for ancestor in self.ancestors:

@@ -27,15 +27,9 @@ SpaceName = Literal["amass", "openxr", "unity"]
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """A frame of reference. Leading dimensions of arrays are arbitrary.
-
-    Attributes:
-        name: the name in options and arguments.
-        world: orthogonal matrix (3, 3) from this space to AMASS' world. It mirrors if the space is
-            left-handed.
-        body: signs (3,) from the T-pose axes of this space to SMPL's body frame. They mirror if the space is
-            left-handed.
-    """
+    """A frame of reference. `world` is the orthogonal matrix (3, 3) from this space to AMASS' world, `body`
+    the signs (3,) from the T-pose axes of this space to SMPL's body frame; both mirror a left-handed space.
+    Leading dimensions of arrays are arbitrary."""
 
     name: str
     world: np.ndarray
@@ -67,9 +61,7 @@ class Space:
 
     def _convert_pose(self, local: np.ndarray, root: np.ndarray) -> np.ndarray:
         """Convert local rotations to the axes of the other T-pose, and replace the root rotation by `root`.
-
-        The signs are their own inverse, so one method converts in both directions.
-        """
+        The signs are their own inverse, so one method converts in both directions."""
         turned = local * np.outer(self.body, self.body).astype(local.dtype)
         turned[..., 0, :, :] = root
         return turned

@@ -34,29 +34,18 @@ class SampleWarning(UserWarning):
 
 
 def find_lost(poses: np.ndarray, still: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return which trackers are lost. `isLost` in the web page's stream.js follows the same rules.
-
-    Programs report a lost tracker in different ways: without a pose, as NaN, far away, at the exact origin,
-    without a rotation, or with its last pose repeated.
-
-    Args:
-        poses: position and rotation matrix of each tracker (n, 12); NaN without a pose.
-        still: how long each tracker has repeated its pose while another tracker moved (n,), seconds.
-    """
+    """Return which trackers (n,) are lost, given poses (n, 12), position and matrix, with NaN without a pose,
+    and for how many seconds (n,) each has repeated its pose while another moved. Programs report a lost
+    tracker without a pose, as NaN, far away, at the exact origin, without a rotation, or with its last pose
+    repeated. `isLost` in the web page's stream.js follows the same rules."""
     has_pose = (np.abs(poses) <= FARTHEST).all(1) & poses[:, :3].any(1) & poses[:, 3:].any(1)
     lost: np.ndarray = ~has_pose | (np.asarray(still) > FROZEN)
     return lost
 
 
 class TrackerReader:
-    """Reads the samples of three trackers.
-
-    Args:
-        fps: samples per second, for samples without a time.
-
-    Attributes:
-        still: how long head, left and right have repeated their poses while another tracker moved, seconds.
-    """
+    """Reads the samples of three trackers; `fps` applies to samples without a time. `still` is how long, in
+    seconds, each has repeated its pose while another tracker moved."""
 
     def __init__(self, fps: float):
         self.period = 1 / fps
@@ -79,10 +68,8 @@ class TrackerReader:
         return self._check(poses, norms)
 
     def read(self, trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray, Lost]:
-        """Convert trackers to positions (3, 3), rotations (3, 3, 3) and lost flags, without counting them.
-
-        A lost tracker gets the identity as its pose. Raises InputError if a tracker is malformed.
-        """
+        """Convert trackers to positions (3, 3), rotations (3, 3, 3) and lost flags, without counting them. A
+        lost tracker gets the identity as its pose. Raises InputError if a tracker is malformed."""
         return self._check(*_read_poses(trackers))
 
     def _check(self, poses: np.ndarray, norms: np.ndarray) -> tuple[np.ndarray, np.ndarray, Lost]:
@@ -97,10 +84,8 @@ class TrackerReader:
 
 
 def _read_poses(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and matrices (3, 12), and the norms of quaternions (3,), 1 for matrices.
-
-    A lost tracker may have NaN, also as its norm. Raises InputError for another shape.
-    """
+    """Return positions and matrices (3, 12), and the norms of quaternions (3,), 1 for matrices. A lost
+    tracker may have NaN, also as its norm. Raises InputError for another shape."""
     poses, quaternions = np.full((3, 12), np.nan), {}
     for index, (name, tracker) in enumerate(zip(TRACKERS, trackers, strict=True)):
         if tracker is None:
@@ -193,14 +178,8 @@ class OddSamples:
         return self.row["jump"] >= JUMPS
 
     def take(self, time: float | None, positions: np.ndarray, lost: Lost) -> None:
-        """Check a sample.
-
-        Args:
-            time: seconds; None for a sample without a time.
-            positions: positions of head, left and right (3, 3), scaled to the network's body and floor,
-                metres, AMASS' axes.
-            lost: the lost flags of the trackers.
-        """
+        """Check a sample: its time in seconds or None, positions (3, 3) of head, left and right, scaled to
+        the network's body and floor (metres, AMASS' axes), and lost flags."""
         odd_kinds: dict[str, bool] = {}
         if not lost[0]:
             head, *hands = positions.tolist()

@@ -47,13 +47,8 @@ Lost = tuple[bool, ...]  # whether head, left and right wrist are lost
 
 
 class TrackerSample(NamedTuple):
-    """Poses of head, left and right wrist at one time, in AMASS' world.
-
-    Attributes:
-        time: seconds.
-        positions: (3, 3), metres.
-        rotations: (3, 3, 3).
-    """
+    """Poses of head, left and right wrist at one time (seconds), in AMASS' world: positions (3, 3), metres,
+    and rotations (3, 3, 3)."""
 
     time: float
     positions: np.ndarray
@@ -61,23 +56,16 @@ class TrackerSample(NamedTuple):
 
 
 def interpolate(a: TrackerSample, b: TrackerSample, time: float) -> TrackerSample:
-    """Interpolate between two samples.
-
-    A time shortly after both samples is extrapolated, up to `FURTHEST`.
-    """
+    """Interpolate between two samples. A time shortly after both samples is extrapolated, up to
+    `FURTHEST`."""
     weight = min((time - a.time) / (b.time - a.time), FURTHEST)
     positions = a.positions + weight * (b.positions - a.positions)
     return TrackerSample(time, positions, slerp(a.rotations, b.rotations, weight))
 
 
 def make_t_pose(body: BodyTree, place: np.ndarray, heading: float) -> TrackerSample:
-    """Return head and wrists of a person in a T-pose.
-
-    Args:
-        body: the person's rest pose.
-        place: the head's position (3,), metres, AMASS' world.
-        heading: radians to the left. At 0, the person looks along -Y and the left side is +X.
-    """
+    """Return head and wrists of a person in a T-pose, with the head at `place` (3,), metres, AMASS' world. At
+    `heading` 0, the person looks along -Y and the left side is +X; it counts in radians to the left."""
     turn = make_vertical_rotation(heading) @ UPRIGHT
     rest = body.rest[body.tracked]
     return TrackerSample(0.0, place + (rest - rest[0]) @ turn.T, np.tile(turn, (3, 1, 1)))
@@ -90,21 +78,16 @@ def make_vertical_rotation(angle: float) -> np.ndarray:
 
 
 def compute_heading(rotation: np.ndarray) -> float:
-    """Return the heading (radians, as in `make_t_pose`) of a joint's global rotation (3, 3).
-
-    It is the twist of the rotation about the vertical, so looking up or down does not change it.
-    """
+    """Return the heading (radians, as in `make_t_pose`) of a joint's global rotation (3, 3): its twist about
+    the vertical, so looking up or down does not change it."""
     upright = rotation @ UPRIGHT.T
     return float(np.arctan2(upright[1, 0] - upright[0, 1], upright[0, 0] + upright[1, 1]))
 
 
 class LostTrackerFiller:
-    """Holds lost trackers at their last poses, and moves returning trackers smoothly to their true poses.
-
-    Args:
-        body: the network's body; its T-pose gives the poses of trackers before their first samples.
-        recovery: seconds until a returning tracker is at its true pose; 0 for a jump.
-    """
+    """Holds lost trackers at their last poses, and moves returning trackers to their true poses over
+    `recovery` seconds. The T-pose of the network's body gives the poses of trackers before their first
+    samples."""
 
     def __init__(self, body: BodyTree, recovery: float = RECOVERY):
         self.body, self.recovery = body, recovery
@@ -136,11 +119,8 @@ class LostTrackerFiller:
         return self.last
 
     def _make_stand_in(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
-        """Return a previous sample for the first sample.
-
-        It is the first sample if no tracker is lost. Otherwise, it is a T-pose under the head. If the head is
-        lost, it is a T-pose at the origin.
-        """
+        """Return a previous sample for the first sample: the first sample itself if no tracker is lost,
+        otherwise a T-pose under the head, or at the origin if the head is lost."""
         if not any(lost):
             return sample
         if lost[0]:
@@ -162,12 +142,7 @@ def hold_lost_trackers(sample: TrackerSample, lost: Lost, last: TrackerSample) -
 
 
 class TrackerFrames:
-    """Converts samples of three trackers to frames at the network's rate; see the module docstring.
-
-    Args:
-        body: the network's body.
-        fps: the network's frames per second.
-    """
+    """Converts samples of three trackers to frames at the network's rate; see the module docstring."""
 
     def __init__(self, body: BodyTree, fps: float):
         self.hold, self.fps = LostTrackerFiller(body), fps
@@ -187,14 +162,9 @@ class TrackerFrames:
     def take(
         self, time: float | None, positions: np.ndarray, rotations: np.ndarray, lost: Lost
     ) -> tuple[list[TrackerSample], bool]:
-        """Return the frames that a sample completes, and whether everything restarts with this sample.
-
-        Args:
-            time: seconds; None for the time of the next frame.
-            positions: (3, 3), metres, AMASS' world.
-            rotations: (3, 3, 3), AMASS' world.
-            lost: the lost flags of the trackers.
-        """
+        """Return the frames that a sample completes, and whether everything restarts with this sample. Its
+        time is in seconds, None for that of the next frame; positions (3, 3), metres, and rotations (3, 3, 3)
+        are in AMASS' world."""
         if time is None:
             time = self.next_time
         if self.last is not None and -GAP <= time - self.last.time <= 0:

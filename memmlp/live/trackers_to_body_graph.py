@@ -60,11 +60,9 @@ OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
 
 
 def convert_to_quaternions(rotations: Tensor) -> Tensor:
-    """Convert matrices (..., 3, 3) to unit quaternions (..., 4), xyzw, w not negative; accurate everywhere.
-
-    The results equal `memmlp.motion.geometry.matrix_to_wxyz`. This function selects the best-conditioned of
-    four formulas by pairwise comparisons, which do not need a computed index.
-    """
+    """Convert matrices (..., 3, 3) to unit quaternions (..., 4), xyzw, w not negative; accurate everywhere,
+    and equal to `memmlp.motion.geometry.matrix_to_wxyz`. The best-conditioned of four formulas is selected by
+    pairwise comparisons, which do not need a computed index."""
     m = rotations.flatten(-2).split(1, -1)
     xx, yy, zz = m[0], m[4], m[8]
     wx, wy, wz = m[7] - m[5], m[2] - m[6], m[3] - m[1]
@@ -88,13 +86,8 @@ FORMATS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 class FullStep(nn.Module):
-    """The step of one frame from trackers to joints, with flat inputs and outputs.
-
-    Args:
-        model: the trained network or its streaming graph.
-        space: the frame of reference of inputs and outputs.
-        output: converts rotation matrices to the output format; a value of FORMATS.
-    """
+    """The step of one frame from trackers to joints, with flat inputs and outputs in the frame of reference
+    `space`. `output` converts rotation matrices; a value of FORMATS."""
 
     world: Tensor
     body: Tensor
@@ -134,12 +127,8 @@ class FullStep(nn.Module):
         return *pose, seen.clamp_min(1), positions, rotations, *kept
 
     def convert_outputs(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return rotations, positions and joints in the graph's frame of reference.
-
-        Args:
-            motion: world motion (1, 198).
-            head: the head tracker's position (1, 3), metres, AMASS' world.
-        """
+        """Return rotations, positions and joints in the graph's frame of reference, for world motion (1, 198)
+        and the head tracker's position (1, 3), metres, AMASS' world."""
         local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
         # Forward kinematics like in `BodyTree.compute_positions`: a graph runs few operations on large arrays
         # faster than many small operations.
@@ -164,11 +153,8 @@ def export_full(
     rotations: str = "matrix",
     opset: int = NATIVE,
 ) -> None:
-    """Write the full step and its metadata as one ONNX file for the CPU in float32.
-
-    Raises:
-        InputError: for an unknown space or rotation format, or an opset that does not support the step.
-    """
+    """Write the full step and its metadata as one ONNX file for the CPU in float32. Raises InputError for an
+    unknown space or rotation format, or an opset that does not support the step."""
     if rotations not in FORMATS:
         raise InputError(f"rotations={rotations}: must be one of {', '.join(FORMATS)}")
     step = FullStep(model.cpu().eval(), find_space(space), FORMATS[rotations]).eval()
@@ -186,10 +172,8 @@ def export_full(
 
 
 def extract_trackers(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Return tracker positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3) of frames (N, 252 or 54).
-
-    The first entry is the time step before the first frame. The velocities of the first frame give its poses.
-    """
+    """Return tracker positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3) of frames (N, 252 or 54). The
+    first entry is the time step before the first frame, which gives the first frame's velocities."""
     sixd = frames[:, SPARSE_ROTATION].unflatten(-1, (3, 6))
     turned = sixd_to_matrix(frames[:1, SPARSE_ANGULAR_VELOCITY].unflatten(-1, (3, 6)))
     rotations, positions = sixd_to_matrix(sixd), frames[:, SPARSE_POSITION].unflatten(-1, (3, 3))
@@ -199,12 +183,9 @@ def extract_trackers(frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def measure_full_differences(model: MotionModel, path: Path, clip: Tensor, space: str = "amass") -> Tensor:
-    """Return each frame's largest difference (N,) between torch and an ONNX file over a clip (N, 252).
-
-    torch and the file each use their own history. torch computes the same as evaluation: features, network
-    and `Normalizer.compute_positions`. Quaternions are converted to matrices first. If a quaternion does not
-    have length 1, all differences are infinity.
-    """
+    """Return each frame's largest difference (N,) between torch and an ONNX file over a clip (N, 252). Each
+    uses its own history. torch computes the same as evaluation: features, network and
+    `Normalizer.compute_positions`. If a quaternion does not have length 1, all differences are infinity."""
     positions, rotations = extract_trackers(clip[:, :SPARSE_DIM].cpu())
     sparse, reference, stream = (
         compute_sparse_features(rotations, positions),

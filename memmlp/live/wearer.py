@@ -2,8 +2,7 @@
 
 A network is trained on bodies of one size, with the floor at height zero. So input positions are scaled about
 the floor by the network's body height divided by the user's. Output positions are scaled back. Angles stay
-the same.
-"""
+the same."""
 
 from __future__ import annotations
 
@@ -34,13 +33,8 @@ MADE = "expected a file from memmlp live --calibration"
 
 @dataclass(frozen=True)
 class Wearer:
-    """The user of the trackers.
-
-    Attributes:
-        height: the person's body height, metres.
-        floor: the height of the floor, metres, in the trackers' frame of reference.
-        scale: the network's body height divided by the user's.
-    """
+    """The user of the trackers: body height and height of the floor in the trackers' frame of reference, both
+    in metres, and the network's body height divided by the user's."""
 
     height: float
     floor: float
@@ -58,16 +52,8 @@ def compute_body_height(body: BodyTree) -> float:
 
 
 def make_wearer(body: BodyTree, height: float | None = None, floor: float = 0.0) -> Wearer:
-    """Return the user of a network.
-
-    Args:
-        body: the network's body.
-        height: the user's body height, metres; None for the height of the network's body.
-        floor: the height of the floor, metres.
-
-    Raises:
-        InputError: if height or floor is out of range.
-    """
+    """Return the user of a network's body; height (None for the body's) and floor in metres. Raises
+    InputError if height or floor is out of range."""
     low, high = HEIGHTS
     if height is not None and not (_is_number(height) and low <= height <= high):
         raise InputError(f"height={height}: must be {low:g} to {high:g} metres, or None")
@@ -82,12 +68,8 @@ def _is_number(value: object) -> bool:
 
 
 class Offsets(NamedTuple):
-    """The poses of head, left and right wrist relative to their devices: joint = device @ offset.
-
-    Attributes:
-        positions: (3, 3), metres, in each device's own axes.
-        rotations: (3, 3, 3), in each device's own axes.
-    """
+    """The poses of head, left and right wrist relative to their devices: joint = device @ offset. Positions
+    (3, 3), metres, and rotations (3, 3, 3) are in each device's own axes."""
 
     positions: np.ndarray
     rotations: np.ndarray
@@ -143,14 +125,7 @@ def check_rotations(names: list[str], rotations: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The calibration of a stream for a user. The fields are arguments of `Stream`.
-
-    Attributes:
-        space: the frame of reference of the offsets.
-        offsets: the offsets from the devices to the joints; None without offsets.
-        height: the user's body height, metres; None for the network's body height.
-        floor: the height of the floor, metres.
-    """
+    """The calibration of a stream for a user. The fields are arguments of `Stream`."""
 
     space: SpaceName
     offsets: Offsets | None = None
@@ -176,12 +151,8 @@ def save_calibration(path: Path, calibration: Calibration, body: BodyTree) -> No
 
 
 def read_calibration(path: Path, space: SpaceName, body: BodyTree) -> Calibration:
-    """Read the calibration for a frame of reference and a network's body.
-
-    Raises:
-        InputError: if the file is not a calibration, or is for another frame of reference or another
-            network body. Height and floor are not checked here.
-    """
+    """Read the calibration for a frame of reference and a network's body. Raises InputError if the file is
+    not a calibration, or is for another frame of reference or body. Height and floor are not checked here."""
     try:
         with open(path, "rb") as file:
             fields = json.loads(file.read(LARGEST))
@@ -207,10 +178,8 @@ def read_calibration(path: Path, space: SpaceName, body: BodyTree) -> Calibratio
 
 
 def _compute_tracked_joints(body: BodyTree) -> np.ndarray:
-    """Return the rest positions (3, 3) of head and wrists, metres, relative to the lowest joint's height.
-
-    The offsets of a calibration are only valid for a body with these positions.
-    """
+    """Return the rest positions (3, 3) of head and wrists, metres, relative to the lowest joint's height. The
+    offsets of a calibration are only valid for a body with these positions."""
     joints = body.rest[body.tracked]
     across, _, ahead = joints.mean(0)
     return joints - [across, body.rest[:, 1].min(), ahead]

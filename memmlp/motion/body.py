@@ -87,16 +87,9 @@ def make_builtin_rest_joints() -> np.ndarray:
 
 
 def load_rest_joints(body: str | Path) -> np.ndarray:
-    """Load the rest positions (22, 3), metres, of a body with zero betas.
-
-    Only `J_regressor @ v_template` is computed: no mesh is skinned.
-
-    Args:
-        body: "builtin", or the path of an SMPL-H `model.npz`.
-
-    Raises:
-        InputError: if the file is not an SMPL-H model.
-    """
+    """Load the rest positions (22, 3), metres, of a body with zero betas: "builtin", or an SMPL-H
+    `model.npz`, of which only `J_regressor @ v_template` is computed. Raises InputError if the file is not an
+    SMPL-H model."""
     if str(body) == "builtin":
         return make_builtin_rest_joints()
     path = Path(body)
@@ -116,7 +109,6 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
 
 
 def _swap_side(name: str) -> str:
-    """Return the name of a joint after mirroring: left and right are exchanged."""
     side, _, rest = name.partition("_")
     return {"left": f"right_{rest}", "right": f"left_{rest}"}.get(side, name)
 
@@ -132,38 +124,21 @@ RECORD = "import.json"
 
 
 def describe_body(body: str, rest: np.ndarray) -> dict[str, Any]:
-    """Return the body's entries in an import record: its name and its rest joints.
-
-    Args:
-        body: `builtin`, or the path of an SMPL-H model.
-        rest: the body's rest joints (22, 3), metres.
-    """
+    """Return a body's entries in an import record: its name and its rest joints (22, 3), metres."""
     return {"body": Path(body).name, "joints": rest.round(6).tolist()}
 
 
 def format_body_name(body: str, rest: np.ndarray) -> str:
-    """Return a body's name. A model's name includes a digest, because all model files have the same name.
-
-    Args:
-        body: `builtin`, or the path of an SMPL-H model.
-        rest: the body's rest joints (22, 3), metres.
-    """
+    """Return a body's name. A model's name includes a digest of its rest joints (22, 3), because all model
+    files have the same name."""
     return "builtin" if body == "builtin" else f"{Path(body).name} {digest(rest.tolist())[:8]}"
 
 
 def check_imported_body(clips: Iterable[Path], rest: np.ndarray, body_source: str) -> None:
-    """Check that imported clips are used with the body of their import.
-
-    The floor height differs by centimetres between bodies. Clips without an import record pass.
-
-    Args:
-        clips: the clips' files.
-        rest: the body's rest joints (22, 3), metres.
-        body_source: the setting, option or network that selected the body, for the message.
-
-    Raises:
-        InputError: if the clips were imported for a different body.
-    """
+    """Check that imported clips are used with the body of their import, given its rest joints (22, 3),
+    metres: the floor height differs by centimetres between bodies. Clips without an import record pass.
+    `body_source` is the setting, option or network that selected the body. Raises InputError if the clips
+    were imported for a different body."""
     folders = {clip.parent.resolve() for clip in clips}
     above = ([parent / RECORD for parent in (folder, *folder.parents)] for folder in folders)
     for path in sorted({path for paths in above if (path := next(filter(Path.is_file, paths), None))}):
@@ -193,14 +168,8 @@ HEAT = ("#2b5fd9", "#27a9e1", "#3fc380", "#f2d43d", "#f28c28", "#c4161c")
 
 
 class Limb(NamedTuple):
-    """A round limb from one joint to another, or from a joint to a tip.
-
-    Attributes:
-        start, end: the joints that determine the colours of its two ends.
-        radii: the radii at its two ends, metres.
-        tip: 0 for a limb between the two joints. Otherwise the limb begins at `end`, and extends by this
-            length, metres, in the direction from `start` to `end`.
-    """
+    """A round limb from one joint to another; `radii` are those at its ends, metres. If `tip` is not 0, the
+    limb begins at `end`, and extends by this length, metres, in the direction from `start` to `end`."""
 
     start: int
     end: int

@@ -25,12 +25,7 @@ RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame 
 
 @dataclass(frozen=True)
 class SkippedFile:
-    """A file that was skipped.
-
-    Attributes:
-        file: the file's path below the folder.
-        reason: why the file was skipped, in one line.
-    """
+    """A skipped file, as its path below the folder, and the reason in one line."""
 
     file: str
     reason: str
@@ -64,19 +59,10 @@ class Clip:
 
 def resample(clip: Clip, fps: float = FPS, interpolation: str = SPLINES) -> tuple[Clip, str]:
     """Resample a clip to exactly `fps`, and return the method: `kept`, `every k. frame`, or `interpolated`.
-
     If the clip's rate is a multiple of `fps`, every k-th frame is kept. Otherwise poses and translation are
-    interpolated at the times k / fps within the clip.
-
-    Args:
-        clip: the clip.
-        fps: the new rate, Hz.
-        interpolation: SPLINES, which give continuous accelerations, or LINES: slerp for rotations and linear
-            interpolation for the translation.
-
-    Raises:
-        InputError: if the clip needs interpolation but has only one frame.
-    """
+    interpolated at the times k / fps within the clip: by SPLINES, which give continuous accelerations, or by
+    LINES, slerp for rotations and linear for the translation. Raises InputError if the clip needs
+    interpolation but has only one frame."""
     ratio = clip.fps / fps
     stride = round(ratio)
     if stride >= 1 and abs(ratio - stride) <= RATE_TOLERANCE * stride:
@@ -120,14 +106,10 @@ Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from AMASS' world: (x, 
 
 
 def convert_to_y_up(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert a clip to a right-handed world with Y up.
-
-    If all rotations are the identity, the person stands upright in T-pose and faces +Z. The rest joints
-    (22, 3), metres, need no conversion, because SMPL's body frame has the same axes.
-
-    Returns:
-        Local rotations (N, 22, 3, 3), of which the root's is global, and the root's positions (N, 3), metres.
-    """
+    """Convert a clip to a right-handed world with Y up: local rotations (N, 22, 3, 3), of which the root's is
+    global, and the root's positions (N, 3), metres. If all rotations are the identity, the person stands
+    upright in T-pose and faces +Z. The rest joints need no conversion, because SMPL's body frame has the same
+    axes."""
     from scipy.spatial.transform import Rotation  # 0.4 s to import
 
     rotations = Rotation.from_rotvec(clip.poses.reshape(-1, 3)).as_matrix().reshape(-1, N_JOINTS, 3, 3)

@@ -45,11 +45,8 @@ class MotionDataset:
 
     @classmethod
     def open(cls, cache: Path, part: str) -> MotionDataset:
-        """Open a part (train, val, test) of a prepared cache, memory-mapped; `.to(device)` copies it.
-
-        Raises:
-            InputError: if the cache is unfinished or damaged, or the part has no clips.
-        """
+        """Open a part (train, val, test) of a prepared cache, memory-mapped; `.to(device)` copies it. Raises
+        InputError if the cache is unfinished or damaged, or the part has no clips."""
         if part not in PARTS:
             raise InputError(f"part={part}: must be one of {', '.join(PARTS)}")
         manifest = Manifest.load(cache)
@@ -71,22 +68,11 @@ class MotionDataset:
         return MotionDataset(*tensors, list(self.names), list(self.groups), self.sources)
 
     def __len__(self) -> int:
-        """Return the number of clips."""
         return len(self.names)
 
     def read_stretches(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
-        """Read the last `length` frames of each clip up to and including frame `end`.
-
-        Before the start of a clip its first frame is repeated, like in the warm-up of a live stream.
-
-        Args:
-            clip: indices of clips (B,).
-            end: last frame in each of the clips (B,), 0 <= end < lengths[clip].
-            length: number of frames.
-
-        Returns:
-            (B, length, 252).
-        """
+        """Read the last `length` frames (B, length, 252) of clips (B,) up to and including their frames `end`
+        (B,). Before the start of a clip its first frame is repeated, like in the warm-up of a live stream."""
         device = self.frames.device
         back = torch.arange(1 - length, 1, device=device)
         frame = (end.to(device)[:, None] + back).clamp_min(0)
@@ -104,24 +90,11 @@ class MotionDataset:
 
 
 class WindowSampler:
-    """Draws random windows of clips. A draw depends only on seed and step.
-
-    A window is identified by its last frame. Every window can be drawn. A clip shorter than the window has
-    one window, which ends at the clip's last frame.
-
-    Args:
-        dataset: the clips.
-        batch: number of windows per draw.
-        window: number of frames per window.
-        seed: seed of the draws.
-        drawn_by: "frames": all windows of the part are equally likely (docs/readings.md, no. 23). "clips":
-            all clips are equally likely.
-        shares: relative frequency of each source's windows; within a source, `drawn_by` applies. None
-            ignores sources.
-
-    Raises:
-        InputError: for an invalid `drawn_by`.
-    """
+    """Draws `batch` random windows of `window` frames. A draw depends only on seed and step. A window is
+    identified by its last frame; a clip shorter than the window has one window, which ends at the clip's last
+    frame. `drawn_by` is "frames", where all windows of the part are equally likely (docs/readings.md, no.
+    23), or "clips", where all clips are. `shares` are the relative frequencies of each source's windows; None
+    ignores sources. Raises InputError for an invalid `drawn_by`."""
 
     def __init__(
         self,
@@ -150,14 +123,10 @@ class WindowSampler:
         return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
 
     def draw_stream_starts(self, step: int, stride: int) -> tuple[Tensor, Tensor]:
-        """Draw the first windows of streams that run to the end of their clips, `stride` frames per step.
-
-        Longer clips are drawn less often, because a stream takes longer to run through them. So all windows
-        are as frequent as with `draw`.
-
-        Returns:
-            Clips (B,) and the last frame of a window in each clip (B,), independent of the draws of `draw`.
-        """
+        """Draw the first windows of streams that run to the end of their clips, `stride` frames per step:
+        clips (B,) and the last frame in each (B,), independent of the draws of `draw`. Longer clips are drawn
+        less often, because a stream takes longer to run through them. So all windows are as frequent as with
+        `draw`."""
         random = np.random.Generator(np.random.Philox(key=[self.seed, step], counter=[0, 0, 1, 0]))
         bounds = np.cumsum(self.weights / np.maximum(self.windows / stride, 1))
         clip = np.searchsorted(bounds, random.random(self.batch) * bounds[-1], side="right")
@@ -176,7 +145,6 @@ def _scale_weights(
 
 
 def _map_array(path: Path) -> Tensor:
-    """Open a .npy file as a memory-mapped, read-only tensor."""
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except (OSError, ValueError) as error:
@@ -215,18 +183,14 @@ SOURCES, SIGNS = _build_mirror_layout()
 
 
 def mirror_frames(frames: Tensor) -> Tensor:
-    """Mirror world frames [X | Theta] (..., 252) at the plane X = 0, and exchange left and right joints.
-
-    If the rest pose is not symmetric, the mirrored motion is motion of the mirrored body.
-    """
+    """Mirror world frames [X | Theta] (..., 252) at the plane X = 0, and exchange left and right joints. If
+    the rest pose is not symmetric, the mirrored motion is motion of the mirrored body."""
     return frames[..., SOURCES.to(frames.device)] * SIGNS.to(frames)
 
 
 class MirroredDataset(MotionDataset):
-    """A dataset with all original clips, followed by a mirrored copy of each clip.
-
-    The frames are stored once and mirrored when a mirrored clip is read.
-    """
+    """A dataset with all original clips, followed by a mirrored copy of each, which is made when it
+    is read."""
 
     def __init__(self, plain: MotionDataset):
         names = [*plain.names, *(f"{name} (mirrored)" for name in plain.names)]

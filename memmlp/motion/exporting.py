@@ -25,13 +25,8 @@ T = TypeVar("T")
 
 
 class Format(NamedTuple):
-    """A file format for exported clips.
-
-    Attributes:
-        suffix: the file name suffix.
-        write: function that writes a clip atomically; its last argument is the rest joints (22, 3), metres.
-        has_bones: whether files contain the body's bones.
-    """
+    """A file format for exported clips. `write` writes a clip atomically; its last argument is the rest
+    joints (22, 3), metres. `has_bones`: whether files contain the body's bones."""
 
     suffix: str
     write: Callable[[Path, Clip, np.ndarray], None]
@@ -47,26 +42,15 @@ SUFFIXES = {each.suffix: each for each in FORMATS.values()}
 
 
 def find_format(path: Path, key: str = "path") -> Format:
-    """Find the format for a file's suffix.
-
-    Args:
-        path: the file.
-        key: the option or argument that gave the path, for the message.
-
-    Raises:
-        InputError: if no format has this suffix.
-    """
+    """Find the format for a file's suffix. Raises InputError, with the option or argument `key`, if there is
+    none."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{key} {path}: the suffix must be one of {', '.join(SUFFIXES)}")
     return SUFFIXES[path.suffix.lower()]
 
 
 def write_motion(path: Path, clip: Clip, rest: np.ndarray, target_format: Format) -> None:
-    """Write a clip in a format, atomically. Missing folders are created.
-
-    Raises:
-        InputError: if the file cannot be written.
-    """
+    """Write a clip in a format, atomically. Missing folders are created. Raises InputError if this fails."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         target_format.write(path, clip, rest)
@@ -76,13 +60,8 @@ def write_motion(path: Path, clip: Clip, rest: np.ndarray, target_format: Format
 
 @dataclass(frozen=True)
 class ExportTarget:
-    """A clip to be written.
-
-    Attributes:
-        name: the clip's name, which is its path below the source folder without suffix.
-        source: the clip's npz file.
-        path: the file to write.
-    """
+    """A clip to be written: its name (its path below the source folder without suffix), npz file, and file to
+    write."""
 
     name: str
     source: Path
@@ -91,13 +70,7 @@ class ExportTarget:
 
 @dataclass(frozen=True)
 class ExportPlan:
-    """The clips that an export writes, and their format.
-
-    Attributes:
-        targets: the clips.
-        format: the format of the files.
-        skipped: folders that cannot be listed.
-    """
+    """The clips that an export writes, their format, and the folders that cannot be listed."""
 
     targets: tuple[ExportTarget, ...]
     format: Format
@@ -106,14 +79,8 @@ class ExportPlan:
 
 @dataclass(frozen=True)
 class ExportReport:
-    """The report of an export.
-
-    Attributes:
-        written: the files that were written.
-        seconds: the total duration of the written clips.
-        skipped: the clips that were skipped.
-        unusual: clip -> its likely mistakes.
-    """
+    """The report of an export: the files and their total duration in seconds, the skipped clips, and clip ->
+    its likely mistakes."""
 
     written: tuple[Path, ...]
     seconds: float
@@ -122,17 +89,10 @@ class ExportReport:
 
 
 def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
-    """Plan the export of one npz file to the file `out`, or of a folder of npz files to the folder `out`.
-
-    Args:
-        source: file or folder.
-        out: file or folder. In a folder, each file has the same relative path as its source.
-        name: the format, one of FORMATS; None chooses it by the suffix of `out`.
-
-    Raises:
-        InputError: if there is nothing to export, the format is unknown, `out` is a file instead of a folder
-            or vice versa, or a source would be overwritten.
-    """
+    """Plan the export of one npz file to the file `out`, or of a folder of npz files to the folder `out`,
+    with the same relative paths. The format `name` is one of FORMATS; None chooses it by the suffix. Raises
+    InputError if there is nothing to export, the format is unknown, `out` is a file instead of a folder or
+    vice versa, or a source would be overwritten."""
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; expected an npz file or a folder of npz files")
     target_format = choose_format(out, name, folder=source.is_dir())
@@ -157,17 +117,8 @@ def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
 
 
 def choose_format(out: Path, name: str | None, folder: bool) -> Format:
-    """Choose the format for `out`: the named format, or else the format of its suffix.
-
-    Args:
-        out: the file, or the folder for several files.
-        name: name of a format, or None.
-        folder: whether `out` must be a folder.
-
-    Raises:
-        InputError: if the format is unknown, name and suffix contradict each other, or `out` is a file
-            instead of a folder or vice versa.
-    """
+    """Choose the named format for `out`, or else that of its suffix. Raises InputError if the format is
+    unknown, name and suffix contradict each other, or `out` is a file instead of a folder or vice versa."""
     if folder and name is None:
         raise InputError(f"--format: required for a folder; must be one of {', '.join(FORMATS)}")
     if folder and (out.is_file() or out.suffix.lower() in SUFFIXES):
@@ -185,19 +136,10 @@ def choose_format(out: Path, name: str | None, folder: bool) -> Format:
 def export(
     plan: ExportPlan, *, body: str = "builtin", fps: float | None = None, strict: bool = False
 ) -> ExportReport:
-    """Write a plan's clips.
-
-    Args:
-        plan: the clips to write.
-        body: `builtin`, or an SMPL-H model.npz. It determines the bones in formats that have bones.
-        fps: frame rate, Hz, to which the clips are resampled; None keeps each clip's rate.
-        strict: whether a bad file raises an error. Otherwise it is skipped and reported, unless it is the
-            only file.
-
-    Raises:
-        InputError: for an invalid body, or a body that differs from the body of the clips' import; if no clip
-            could be read, or a file cannot be written.
-    """
+    """Write a plan's clips, resampled to `fps` unless it is None. `body` (`builtin`, or an SMPL-H model.npz)
+    determines the bones in formats that have bones. A bad file is skipped and reported unless `strict` is set
+    or it is the only one. Raises InputError for an invalid body, or a body that differs from the body of the
+    clips' import; if no clip could be read, or a file cannot be written."""
     rest = load_rest_joints(body)
     if plan.format.has_bones:
         check_imported_body([target.source for target in plan.targets], rest, f"--body {body}")
@@ -217,20 +159,11 @@ def convert_and_export(
     batch: int = 1,
     strict: bool = False,
 ) -> ExportReport:
-    """Convert a plan's clips and write them, with a progress bar.
-
-    Args:
-        plan: the clips to write.
-        rest: the body's rest joints (22, 3), metres.
-        prepare: first step of the conversion, for one clip; may raise InputError.
-        finish: second step, for up to `batch` clips: names and prepared clips -> converted clips.
-        batch: maximum number of clips per call of `finish`.
-        strict: whether a bad file raises an error. Otherwise it is skipped and reported, unless it is the
-            only file.
-
-    Raises:
-        InputError: for a bad file (see `strict`), if no clip could be read, or if a file cannot be written.
-    """
+    """Convert a plan's clips and write them on a body with rest joints (22, 3), metres, with a progress bar.
+    `prepare` is the first step, for one clip; it may raise InputError. `finish` is the second step, for up to
+    `batch` clips: names and prepared clips -> converted clips. A bad file is skipped and reported unless
+    `strict` is set or it is the only one. Raises InputError for a bad file, if no clip could be read, or if a
+    file cannot be written."""
     skipped, faults = list(plan.skipped), dict[str, str]()
     written, seconds = list[Path](), 0.0
 

@@ -53,10 +53,8 @@ def matrix_to_wxyz(matrix: Tensor) -> Tensor:
 
 
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """Convert matrices (..., 3, 3) to axis-angle (..., 3) of norm at most pi.
-
-    It is accurate at 0 and near pi, because it goes through a quaternion.
-    """
+    """Convert matrices (..., 3, 3) to axis-angle (..., 3) of norm at most pi. It is accurate at 0 and near
+    pi, because it goes through a quaternion."""
     quaternion = matrix_to_wxyz(matrix)
     vector = quaternion[..., 1:]
     sine = vector.norm(dim=-1, keepdim=True)
@@ -71,10 +69,8 @@ def matrix_to_sixd(matrix: Tensor) -> Tensor:
 
 
 def sixd_to_matrix(sixd: Tensor) -> Tensor:
-    """Convert 6D (..., 6) to matrices (..., 3, 3) by Gram-Schmidt.
-
-    Any two columns that are not zero and not parallel give a rotation.
-    """
+    """Convert 6D (..., 6) to matrices (..., 3, 3) by Gram-Schmidt. Any two columns that are not zero and not
+    parallel give a rotation."""
     first = F.normalize(sixd[..., :3], dim=-1)
     second = sixd[..., 3:]
     second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
@@ -97,15 +93,10 @@ def compute_geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the joints' global rotations (..., 22, 3, 3) and positions (..., 22, 3).
-
-    Joints at the same depth of the tree are computed together, which is fast.
-
-    Args:
-        local: local rotations (..., 22, 3, 3); the root's rotation is global.
-        root: position of the root joint (..., 3), metres, world.
-        rest: rest positions (22, 3), metres; only the offsets between joint and parent matter.
-    """
+    """Return the joints' global rotations (..., 22, 3, 3) and positions (..., 22, 3), metres, world, for
+    local rotations (..., 22, 3, 3), of which the root's is global, and the root's position (..., 3). Of
+    `rest` (22, 3), only the offsets between joint and parent matter. Joints at the same depth of the tree are
+    computed together, which is fast."""
     offsets = (rest - rest[list(PARENTS)])[..., None]  # the root's offset is not used
     top, *levels = local.split([1, *(joints.stop - joints.start for joints, _ in LEVELS)], -3)
     rotations, positions = [top], [root[..., None, :, None]]
@@ -117,10 +108,8 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
 
 
 def build_bone_chains() -> Tensor:
-    """Build the matrix (22, 21) that sums rotated bones to joint positions relative to the head.
-
-    Each joint except the root has a bone, which leads from its parent to the joint.
-    """
+    """Build the matrix (22, 21) that sums rotated bones to joint positions relative to the head. Each joint
+    except the root has a bone, which leads from its parent to the joint."""
     chains = torch.zeros(N_JOINTS, N_JOINTS - 1)
     for joint in range(1, N_JOINTS):
         chains[joint] = chains[PARENTS[joint]]
@@ -152,12 +141,8 @@ LEVELS: tuple[tuple[slice, list[slice]], ...] = (
 
 
 def compute_clip_kinematics(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute a clip's global rotations (N, 22, 3, 3) and positions (N, 22, 3), metres, world.
-
-    Args:
-        clip: the motion.
-        rest: the body's rest joints (22, 3), metres.
-    """
+    """Compute a clip's global rotations (N, 22, 3, 3) and positions (N, 22, 3), metres, world, on a body with
+    rest joints (22, 3), metres."""
     local = axis_angle_to_matrix(torch.from_numpy(clip.poses))
     joints = torch.from_numpy(rest)
     rotations, positions = forward_kinematics(local, joints[0] + torch.from_numpy(clip.trans), joints)
@@ -165,15 +150,9 @@ def compute_clip_kinematics(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, n
 
 
 def compute_sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
-    """Compute the network inputs X from three trackers (AvatarPoser's features, Sec. 3.1 of the paper).
-
-    Args:
-        rotations: global rotations of head, left and right wrist (N, 3, 3, 3).
-        positions: global positions of the same joints (N, 3, 3), metres.
-
-    Returns:
-        (N - 1, 54), with the layout of `memmlp.motion.body.SPARSE_*`. Frame 0 has no velocity and is dropped.
-    """
+    """Compute the network inputs X (N - 1, 54) from three trackers (AvatarPoser's features, Sec. 3.1 of the
+    paper): global rotations (N, 3, 3, 3) and positions (N, 3, 3), metres, of head, left and right wrist.
+    `memmlp.motion.body.SPARSE_*` has the layout. Frame 0 has no velocity and is dropped."""
     angular = rotations[:-1].transpose(-1, -2) @ rotations[1:]
     parts = [
         matrix_to_sixd(rotations[1:]),
@@ -185,13 +164,8 @@ def compute_sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
 
 
 def compute_motion_frames(poses: Tensor, trans: Tensor, rest: Tensor) -> Tensor:
-    """Compute a clip's frames [X | Theta] (N - 1, 252), world.
-
-    Args:
-        poses: axis-angle (N, 22, 3): local rotations; the root's rotation is global.
-        trans: translation (N, 3), metres; the root joint is at rest[0] + trans.
-        rest: rest positions (22, 3), metres.
-    """
+    """Compute a clip's frames [X | Theta] (N - 1, 252), world, from axis-angle poses (N, 22, 3), translation
+    (N, 3), metres, and rest positions (22, 3), metres; see `Clip`."""
     local = axis_angle_to_matrix(poses)
     rotations, positions = forward_kinematics(local, trans + rest[0], rest)
     tracked = list(TRACKED)

@@ -20,13 +20,6 @@ if TYPE_CHECKING:
 
 
 class PreparedMotion(NamedTuple):
-    """A prepared cache and its manifest.
-
-    Attributes:
-        cache: the cache folder.
-        manifest: the cache's manifest.
-    """
-
     cache: Path
     manifest: Manifest
 
@@ -40,11 +33,8 @@ class PreparedMotion(NamedTuple):
         return bool(self.manifest.part(part))
 
     def open(self, part: str) -> MotionDataset:
-        """Open a part of the cache, memory-mapped (`MotionDataset.open`).
-
-        Raises:
-            InputError: if the cache is unfinished, or was replaced by a cache of different clips.
-        """
+        """Open a part of the cache, memory-mapped (`MotionDataset.open`). Raises InputError if the cache is
+        unfinished, or was replaced by a cache of different clips."""
         # Imported here because it imports torch, which the search for finished runs does not need.
         from memmlp.motion.dataset import MotionDataset
 
@@ -60,14 +50,9 @@ class PreparedMotion(NamedTuple):
 
 @dataclass(frozen=True)
 class MotionSource:
-    """One or more folders of clips, and their cache. Synthetic clips are generated.
-
-    Attributes:
-        clips: the folders of clips, with split and body.
-        generate: function that generates the synthetic clips of a folder; None for the user's clips.
-        caches: folder of all caches.
-        partial: whether the split's list may have entries without a clip.
-    """
+    """One or more folders of clips, and their cache in the folder of all caches. `generate` generates the
+    synthetic clips of a folder; None for the user's clips. `partial`: the split's list may have entries
+    without a clip."""
 
     clips: ClipFolder
     generate: Callable[[Path], object] | None
@@ -86,14 +71,9 @@ class MotionSource:
         return self.clips.split.groups_digest
 
     def prepare(self) -> PreparedMotion:
-        """Return the cache and its manifest. A missing or outdated cache is prepared first.
-
-        Missing synthetic clips are generated.
-
-        Raises:
-            InputError: if the cache can't be prepared, or if the split's list has an entry without a clip and
-                `partial` is false. Missing files are reported before any file is read.
-        """
+        """Return the cache and its manifest. A missing or outdated cache, and missing synthetic clips, are
+        made first. Raises InputError if the cache can't be prepared, or if the split's list has an entry
+        without a clip and `partial` is false. Missing files are reported before any file is read."""
         if self.generate is not None:
             _generate_once(Path(str(self.clips.root)), self.generate)
         split, root = self.clips.split, self.clips.root
@@ -112,11 +92,8 @@ class MotionSource:
 
 
 def _generate_once(root: Path, generate: Callable[[Path], object]) -> None:
-    """Generate a folder of clips unless it exists; only one process does so at a time.
-
-    The clips are generated in a temporary folder that is renamed at the end. So an interruption leaves no
-    incomplete folder.
-    """
+    """Generate a folder of clips unless it exists; only one process does so at a time. The clips are
+    generated in a temporary folder that is renamed at the end."""
     if root.exists():
         return
     root.parent.mkdir(parents=True, exist_ok=True)

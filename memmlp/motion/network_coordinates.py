@@ -20,10 +20,8 @@ from memmlp.motion.body import (
 
 
 class Coordinates:
-    """The slot's interface. Methods that are not overridden use world coordinates.
-
-    Each frame has its own local coordinates. `find_origin` computes their origin from the frame's inputs; the
-    other methods convert inputs, motion and rotations.
+    """The slot's interface. Methods that are not overridden use world coordinates. Each frame has its own
+    local coordinates: `find_origin` computes their origin from the frame's inputs; the other methods convert.
     """
 
     def find_origin(self, sparse: Tensor) -> Tensor:
@@ -55,9 +53,7 @@ class World(Coordinates):
 @component("coordinates", "head_relative")
 class HeadRelative(Coordinates):
     """Coordinates relative to the head's position on the floor in the same frame (docs/readings.md, no. 20).
-
-    Heights stay unchanged.
-    """
+    Heights stay unchanged."""
 
     def find_origin(self, sparse: Tensor) -> Tensor:
         """Return the head's position on the floor (..., 3), metres, for inputs (..., 54)."""

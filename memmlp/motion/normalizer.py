@@ -28,23 +28,16 @@ Change = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def use_float32(device: torch.device) -> AbstractContextManager[object]:
-    """Compute in float32 within the context, even with mixed precision (`optim.precision=bf16`).
-
-    It has no effect without mixed precision, or on exported graphs.
-    """
+    """Compute in float32 within the context, even with mixed precision (`optim.precision=bf16`). It has no
+    effect without mixed precision, or on exported graphs."""
     mixed = torch.is_autocast_enabled(device.type)
     return torch.autocast(device.type, enabled=False) if mixed else nullcontext()
 
 
 class Normalizer(nn.Module):
-    """Converts between world frames and network space: local coordinates and z-scores.
-
-    Args:
-        coordinates: World(), HeadRelative() or Heading().
-        rest: rest positions (22, 3), metres, for forward kinematics.
-        mean: mean (252,) of frames [X | Theta] in the chosen coordinates.
-        std: standard deviation (252,) of the same frames; values below 1e-3 are replaced by 1e-3.
-    """
+    """Converts between world frames and network space: local `coordinates` and z-scores by mean and standard
+    deviation (252,) of frames [X | Theta] in them; deviations below 1e-3 count as 1e-3. Forward kinematics
+    uses the rest positions (22, 3), metres."""
 
     MIN_STD = 1e-3  # a smaller divisor would turn constant features into noise
 
@@ -112,10 +105,8 @@ class Normalizer(nn.Module):
 
     def compute_positions(self, motion: Tensor, sparse: Tensor) -> Tensor:
         """Compute joint positions (..., 22, 3), metres, world, from the rotations in world motion (..., 198).
-
-        Forward kinematics gives the pose. The translation puts the head at the tracker's position in the
-        world inputs (..., 54) (docs/readings.md, no. 22).
-        """
+        The translation puts the head at the tracker's position in the world inputs (..., 54)
+        (docs/readings.md, no. 22)."""
         rotations = motion[..., ROTATION].to(sparse.dtype).unflatten(-1, (N_JOINTS, 6))
         with use_float32(sparse.device):
             root = torch.zeros_like(sparse[..., :3])
@@ -125,20 +116,16 @@ class Normalizer(nn.Module):
 
     def decode_rotations(self, rotation: Tensor, sparse: Tensor) -> Tensor:
         """Convert network-space rotations (..., 132) to world motion (..., 198), for world inputs (..., 54).
-
-        `compute_positions` adds the positions, without gradients.
-        """
+        `compute_positions` adds the positions, without gradients."""
         motion = F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
         world = self.decode_motion(motion, self.find_origin(sparse))
         positions = self.compute_positions(world.detach(), sparse).flatten(-2)
         return torch.cat([world[..., ROTATION], positions], -1)
 
     def build_world_motion(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
-        """Build world motion (..., 198) from global rotations (..., 132), 6D, and world inputs (..., 54).
-
-        The positions are sums of the rotated bones, with the head at its tracker and without gradients.
-        `change` may change the pose before the rotations are converted to local ones.
-        """
+        """Build world motion (..., 198) from global rotations (..., 132), 6D, and world inputs (..., 54). The
+        positions are sums of the rotated bones, with the head at its tracker and without gradients. `change`
+        may change the pose before the rotations are converted to local ones."""
         matrices = sixd_to_matrix(rotations.unflatten(-1, (N_JOINTS, 6)))
         parents = matrices[..., list(PARENTS[1:]), :, :]
         offsets = self.rest[1:] - self.rest[list(PARENTS[1:])]

@@ -39,11 +39,8 @@ FROZEN, TURNING = 0.5, 0.1  # seconds with constant trans; rad/s of a leg that m
 
 
 def check_plausible(path: Path, clip: Clip) -> str:
-    """Return a clip's likely mistakes (`find_faults`) as one line.
-
-    Raises:
-        InputError: if the clip cannot be human motion; the message names the file.
-    """
+    """Return a clip's likely mistakes (`find_faults`) as one line. Raises InputError, with the file, if the
+    clip cannot be human motion."""
     reason = explain_implausibility(clip)
     if reason is not None:
         raise InputError(f"{path}: {reason}")
@@ -128,11 +125,9 @@ def _find_jumps(clip: Clip) -> Iterator[str]:
 
 
 def _is_y_up(clip: Clip) -> bool:
-    """Return whether the person stands along Y, and never along Z.
-
-    A person who lies with the head towards +Y looks similar. But such a person rarely has the feet at y = 0,
-    and does not rise by a metre while the feet stay in one plane.
-    """
+    """Return whether the person stands along Y, and never along Z. A person who lies with the head towards +Y
+    looks similar, but rarely has the feet at y = 0, and does not rise by a metre while the feet stay in one
+    plane."""
     joints = _compute_positions(clip, _spread_frames(clip))
 
     def measure_standing(axis: int) -> float:
@@ -197,13 +192,8 @@ SLIDING = 2.0  # ratio of the feet's speed to that with exchanged legs; measured
 
 
 def find_dynamic_faults(positions: np.ndarray, fps: float, clip_fps: float) -> Iterator[str]:
-    """Yield descriptions of a wrong rate and of exchanged legs.
-
-    Args:
-        positions: joint positions (N, 22, 3), metres, world (Z up), with N > 1.
-        fps: rate of the positions, Hz.
-        clip_fps: rate of the clip, Hz, for messages.
-    """
+    """Yield descriptions of a wrong rate and of exchanged legs, for joint positions (N, 22, 3), metres, world
+    (Z up), N > 1, at `fps`. Messages name the clip's rate `clip_fps`."""
     label = f"so the frame rate {clip_fps:g} Hz may be"
     swings = np.array(_measure_swings(positions, fps)).reshape(-1, 3)
     if len(swings) >= FEWEST:

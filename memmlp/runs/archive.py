@@ -1,9 +1,7 @@
 """Exports a run to one file and imports it: a zip with the run's folder, named by the run's id.
 
-Archives are not trusted. An archive is unpacked into a temporary folder. Only names of run files are
-accepted; nothing is executed or unpickled. The run is moved to the outputs folder only if it is complete and
-matches the digests in its files.
-"""
+Archives are not trusted: only names of run files are accepted, nothing is executed or unpickled, and the run
+is moved to the outputs folder only if it is complete and matches the digests in its files."""
 
 from __future__ import annotations
 
@@ -42,13 +40,8 @@ ALLOWED = re.compile(
 
 
 def export_run(run: Run, out: Path) -> str:
-    """Write a finished run to an archive, and return the archive's SHA-256.
-
-    The checkpoint is left out, since a finished run is never resumed.
-
-    Raises:
-        InputError: if the run is not finished, or if files are missing, damaged or have changed.
-    """
+    """Write a finished run, without its checkpoint, to an archive; return the archive's SHA-256. Raises
+    InputError if the run is not finished, or if files are missing, damaged or have changed."""
     if not run.done:
         raise InputError(f"run {run.id}: must be finished; its status is {run.status}")
     run.check_records()
@@ -72,21 +65,10 @@ def import_run(
     max_size: int = MAX_SIZE,
     report: Callable[[str], None] = lambda line: None,
 ) -> tuple[Run, bool]:
-    """Add the run in an archive to an outputs folder.
-
-    Args:
-        path: the archive.
-        outputs: the outputs folder.
-        sha256: the required digest of the archive; None to skip this check.
-        max_size: the largest allowed total size of all files, bytes.
-        report: gets a line if the run already exists but lacks evaluations or deployments from the archive.
-
-    Returns:
-        The run, and whether it is new. An existing run with the same weights is left unchanged.
-
-    Raises:
-        InputError: if the file is not an archive of a run, is too large, or a digest is wrong.
-    """
+    """Add the run in an archive to an outputs folder; return the run, and whether it is new. An existing run
+    with the same weights is left unchanged; then `report` gets a line if it lacks evaluations or deployments.
+    `sha256` is the required digest, `max_size` the allowed total size of all files, bytes. Raises InputError
+    if the file is not an archive of a run, is too large, or a digest is wrong."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if sha256 is not None and file_digest(path) != sha256.lower():
@@ -136,7 +118,6 @@ def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> tuple[s
 
 
 def _move_to_runs(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Path) -> tuple[Run, bool]:
-    """Unpack a run into a temporary folder, check it, and move it to the outputs folder."""
     place = Run.from_id(outputs, run_id)
     place.folder.parent.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(dir=place.folder.parent, prefix=".import-"))

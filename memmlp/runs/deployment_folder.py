@@ -27,14 +27,8 @@ FILES = (LATENCY, *ONNX_FILES.values())
 
 
 class DeploymentFolder:
-    """A deployment of a run: the folder runs/<id>/deployments/<identity>/.
-
-    Attributes:
-        folder: the folder.
-        onnx: path of the float32 ONNX file.
-        int8: path of the int8 ONNX file, which may not exist.
-        latency: path of the file with the measurements; it is written last.
-    """
+    """A deployment of a run: the folder runs/<id>/deployments/<identity>/. Its measurements (`latency`) are
+    written last; the int8 file may not exist."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -97,12 +91,8 @@ class DeploymentFolder:
 
 
 def is_accurate_enough(cost: Mapping[str, Any]) -> bool:
-    """Return whether a lower precision is accurate enough to replace float32.
-
-    Args:
-        cost: the relative growth of its errors, "growth" and "jitter_growth". Missing and NaN count as
-            inaccurate.
-    """
+    """Return whether a lower precision can replace float32, given the relative "growth" and "jitter_growth"
+    of its errors. Missing and NaN count as inaccurate."""
     growth, jitter = (to_number(cost.get(name, math.inf)) for name in ("growth", "jitter_growth"))
     return growth <= MAX_GROWTH and jitter <= MAX_JITTER_GROWTH
 

@@ -78,10 +78,8 @@ def _run_git(*args: str) -> str:
 @functools.cache
 def create_code_patch() -> str:
     """Return a patch from the package's commit to the code of this process, and the names of untracked files.
-
-    The patch is empty without modifications or outside a git checkout. It is created once for each process,
-    since the process does not run later edits.
-    """
+    It is empty without modifications or outside a git checkout, and created once, since later edits do not
+    run."""
     git = _describe_commit()
     if not git or not git["dirty"]:
         return ""
@@ -93,10 +91,8 @@ def create_code_patch() -> str:
 
 
 def compute_code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
-    """Return a code digest for each file that affects the numbers of a run.
-
-    Comments and docstrings are ignored. Files of users' packages are named PACKAGE:FILE.
-    """
+    """Return a code digest for each file that affects the numbers of a run (`compute_code_digest`). Files of
+    users' packages are named PACKAGE:FILE."""
     return {name: compute_code_digest(content) for name, content in read_code_files(packages).items()}
 
 
@@ -123,10 +119,8 @@ def compute_byte_digest(content: bytes) -> str:
 
 
 def list_changed_files(manifest: Mapping[str, Any]) -> list[str]:
-    """Return the files that have changed since a run with this manifest began (`list_differing_files`).
-
-    Only files with different bytes are parsed, since parsing all files takes half a second.
-    """
+    """Return the files that have changed since a run with this manifest began (`list_differing_files`). Only
+    files with different bytes are parsed, since parsing all files takes half a second."""
     before, unread = manifest.get("sources", {}), manifest.get("source_bytes", {})
     files = read_code_files(manifest.get("plugins", ())) if before else {}
     return sorted(
@@ -139,10 +133,8 @@ def list_changed_files(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def list_differing_files(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
-    """Return the files with different digests in two results of `compute_code_digests`.
-
-    Files in only one of them are ignored: new code runs only if other code or the config changed, too.
-    """
+    """Return the files with different digests in two results of `compute_code_digests`. Files in only one of
+    them are ignored: new code runs only if other code or the config changed, too."""
     return sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
 
 
@@ -153,17 +145,14 @@ def _read_package_code() -> dict[str, bytes]:
 
 
 def _affects_results(path: Path) -> bool:
-    """Return whether a file affects the numbers of a run, given its path relative to the package."""
     unused = path.parts[0].startswith("_") or any(map(path.is_relative_to, NOT_NUMBERS))
     return path.as_posix() in WIRING or not unused
 
 
 @functools.cache
 def compute_code_digest(code: bytes) -> str:
-    """Return a digest of Python code (12 hex digits) that ignores layout, comments and docstrings.
-
-    If the code can't be parsed, return a digest of its bytes.
-    """
+    """Return a digest (12 hex digits) of Python code without layout, comments and docstrings; of its bytes if
+    it can't be parsed."""
     try:
         tree = ast.parse(code.decode())
     except (SyntaxError, ValueError):
@@ -175,10 +164,7 @@ def compute_code_digest(code: bytes) -> str:
 
 
 def _read_user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
-    """Return the content of all Python files in users' packages, by package and file, without imports.
-
-    If a package is not found, its entry is empty.
-    """
+    """Return the content of all Python files in users' packages, by package and file; empty if not found."""
     return {
         name: {file: _read_user_code(path) for file, path in _list_package_files(name).items()}
         for name in packages
@@ -214,7 +200,6 @@ def _read_user_code(path: Path) -> bytes:
 
 
 def _list_package_files(name: str) -> dict[str, Path]:
-    """Return the Python files of a user's package, by relative path; empty if the package is not found."""
     spec = _find_spec(name)
     if spec is None:
         return {}
@@ -259,14 +244,8 @@ FACTS = ("component_versions", "git", "version", "sources", "plugins", "packages
 
 
 def list_prerequisite_origins(manifest: Mapping[str, Any], weights: str | None) -> list[dict[str, Any]]:
-    """Return the origins of all prerequisite runs for a new run, the direct one first.
-
-    Each origin has the `id` and `kind` of a run, the SHA-256 of its `weights`, and the known FACTS.
-
-    Args:
-        manifest: the manifest of the direct prerequisite run.
-        weights: the SHA-256 of its weights.
-    """
+    """Return the origins of all prerequisite runs for a new run, the direct one first: `id`, `kind`, SHA-256
+    of its `weights`, and the known FACTS of its manifest."""
     origin = {"id": manifest.get("id"), "kind": manifest.get("kind"), "weights": weights}
     facts = {name: manifest[name] for name in FACTS if name in manifest}
     return [origin | facts, *get_recorded_prerequisites(manifest)]
@@ -284,15 +263,9 @@ def collect_prerequisite_versions(manifest: Mapping[str, Any]) -> dict[str, int]
 
 
 def merge_run_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge the facts about code and machine before and after a training was resumed.
-
+    """Merge the facts about code and machine before (empty from scratch) and after a training was resumed.
     Different values are both kept. The digest of a changed file is replaced by "mixed". Current prerequisite
-    runs come first, then earlier versions of prerequisite runs that were trained again.
-
-    Args:
-        before: the manifest before resuming; empty if the training starts from scratch.
-        after: the new facts.
-    """
+    runs come first, then earlier versions of prerequisite runs that were trained again."""
     merged = dict(after)
     for key in MACHINE:
         earlier_values = [before[key]] if key in before and before[key] != after.get(key) else []

@@ -52,10 +52,8 @@ def is_current(path: Path, report: Mapping[str, Any]) -> bool:
 
 
 def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
-    """Return the changed component versions of an evaluation, such as "mode.window 2 -> 3", or None.
-
-    Custom metrics from packages that are not in use are ignored.
-    """
+    """Return the changed component versions of an evaluation, such as "mode.window 2 -> 3", or None. Custom
+    metrics from packages that are not in use are ignored."""
     recorded = report.get("component_versions") or {}
     comparable = {name: number for name, number in recorded.items() if find_version(name)}
     return ", ".join(list_outdated(comparable)) or None
@@ -64,11 +62,8 @@ def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
 def make_preference_key(
     path: Path, report: Mapping[str, Any], config: Mapping[str, Any]
 ) -> tuple[bool, bool, str]:
-    """Return a sort key for a run's evaluations; the preferred evaluation comes last.
-
-    The order is by current component versions, then by the inverse kinematics in the run's config, then by
-    time.
-    """
+    """Return a sort key for a run's evaluations; the preferred one comes last: by current component versions,
+    then by the inverse kinematics in the run's config, then by time."""
     settings = report.get("settings") or {}
     configured = get_solver_name(settings) == get_solver_name(config.get("evaluation") or {})
     return is_current(path, report), configured, str(report.get("made"))
@@ -84,10 +79,7 @@ def find_combined_solvers(reports: Sequence[Mapping[str, Any]]) -> dict[str, str
 
 
 def keep_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Remove the branch `combined` where its inverse kinematics differs from the mode's last report.
-
-    So merged results never mix two kinds of inverse kinematics.
-    """
+    """Remove the branch `combined` where its inverse kinematics differs from the mode's last report."""
     last = find_combined_solvers(reports)
 
     def fits(report: Mapping[str, Any]) -> bool:
@@ -105,12 +97,8 @@ def _remove_combined(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def add_solver_names(results: Mapping[str, Any], solvers: Mapping[str, str | None]) -> dict[str, Any]:
-    """Add the solver's name to the branch `combined`, such as "combined-lbfgs-15".
-
-    Args:
-        results: results by mode and branch; other entries are kept.
-        solvers: the inverse kinematics solvers by mode (`find_combined_solvers`).
-    """
+    """Add the solver's name (by mode, `find_combined_solvers`) to the branch `combined`: "combined-
+    lbfgs-15"."""
 
     def rename(mode: str, branch: str) -> str:
         return f"{branch}-{solvers[mode]}" if branch == COMBINED and solvers.get(mode) else branch
@@ -124,19 +112,10 @@ def add_solver_names(results: Mapping[str, Any], solvers: Mapping[str, str | Non
 
 
 class ConfiguredEvaluations:
-    """A run's evaluations that match the run's config.
-
-    Attributes:
-        paths: the evaluation files; the preferred one is last (`make_preference_key`).
-    """
+    """A run's evaluations that match the run's config. The preferred of the `paths` is last
+    (`make_preference_key`)."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any]):
-        """Read the matching evaluations in a folder.
-
-        Args:
-            folder: the run's evaluations folder.
-            config: the run's config.
-        """
         every = {path: records.read(path, records.Evaluation) for path in sorted(folder.glob("*.json"))}
         matching = [
             (path, one)
@@ -148,11 +127,7 @@ class ConfiguredEvaluations:
 
     @property
     def results(self) -> dict[str, dict[str, dict[str, float | None]]]:
-        """The mean errors, by mode, branch and metric; `combined` is from one kind of inverse kinematics.
-
-        Raises:
-            InputError: if a file is damaged.
-        """
+        """The mean errors, by mode, branch and metric. Raises InputError if a file is damaged."""
         results: dict[str, dict[str, dict[str, float | None]]] = {}
         for report in keep_one_solver(self._read_reports()):
             branches = results.setdefault(report["mode"], {})
@@ -163,11 +138,8 @@ class ConfiguredEvaluations:
 
     @property
     def combined_solvers(self) -> dict[str, str | None]:
-        """The inverse kinematics of the branch `combined`, by mode, such as "arms"; None if unknown.
-
-        Raises:
-            InputError: if a file is damaged.
-        """
+        """The inverse kinematics of the branch `combined`, by mode, such as "arms"; None if unknown. Raises
+        InputError if a file is damaged."""
         return find_combined_solvers(self._read_reports())
 
     @property

@@ -18,14 +18,7 @@ REASONS = ("failed", "old", "orphaned")
 
 
 class GarbageRun(NamedTuple):
-    """A run that may be deleted.
-
-    Attributes:
-        run: the run.
-        kind: one of REASONS.
-        reason: the reason why it may be deleted.
-        size: the size of its folder, bytes.
-    """
+    """A run that may be deleted: `kind` is one of REASONS, `size` that of its folder in bytes."""
 
     run: Run
     kind: str
@@ -34,14 +27,8 @@ class GarbageRun(NamedTuple):
 
 
 def find_garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[GarbageRun]:
-    """Find the runs that may be deleted.
-
-    Runs in progress, runs with a tag or a note, and prerequisites of remaining runs are never returned.
-
-    Args:
-        outputs: the outputs folder.
-        kinds: the REASONS to search for.
-    """
+    """Find the runs that may be deleted for these REASONS. Runs in progress, runs with a tag or a note, and
+    prerequisites of remaining runs are never returned."""
     runs = list_runs(outputs)
     orphans, requested = _find_orphans(outputs, runs), set(kinds)
     candidates = {}
@@ -80,11 +67,8 @@ def _find_deletion_reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, st
 
 
 def _find_orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
-    """Return the reason why a run is an orphan, by run id.
-
-    Orphans are prerequisite runs that are in no plan and that no run uses, and folders of runs that never
-    started.
-    """
+    """Return the reason why a run is an orphan, by run id: a prerequisite run that is in no plan and that no
+    run uses, or a folder of a run that never started."""
     planned = {task["id"] for path in _list_plans(outputs) for task in _read_entries(path, "tasks")}
     used = _list_prerequisites(runs) | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}

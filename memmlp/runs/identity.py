@@ -1,12 +1,10 @@
 """Ids: a hash of everything that affects the result of a stage.
 
-The stages are training, evaluation and deployment. A **run** is the training of a network or of a VQ-VAE. Its
-id is a hash of its config, its data, the id of its prerequisite run, and its component versions. An
-**evaluation** has one mode, with or without inverse kinematics. A **deployment** has ONNX files and their
-latencies. Both have their own ids, which depend only on settings that can change their own result. So a new
-mode or precision repeats only its stage, not the training. A component is identified by its name in the
-config, never by the path of its class.
-"""
+A **run** is the training of a network or of a VQ-VAE. Its id is a hash of its config, its data, the id of its
+prerequisite run, and its component versions. An **evaluation** has one mode, with or without inverse
+kinematics. A **deployment** has ONNX files and their latencies. Their own ids depend only on settings that
+can change their own result, so a new mode or precision repeats only its stage. A component is identified by
+its name in the config, never by the path of its class."""
 
 from __future__ import annotations
 
@@ -121,15 +119,9 @@ EXPORTED = {"graph": "auto", "precision": "fp32", "opset": 18}
 
 @dataclass(frozen=True)
 class Identity:
-    """The identity of a run.
-
-    Attributes:
-        kind: NETWORK for every motion network, including baselines; "vqvae" or the name of the trained part
-            for a prerequisite run.
-        config: the resolved config. Neutral keys and keys of later stages are ignored, and 1 equals 1.0.
-        data: digest of the prepared data.
-        prerequisite: the identity of the run that provides weights for this run.
-    """
+    """The identity of a run: its `kind` (NETWORK, "vqvae" or the name of the trained part), resolved
+    `config`, digest of the prepared `data`, and the run that provides its weights. Neutral keys and keys of
+    later stages are ignored, and 1 equals 1.0."""
 
     kind: str
     config: Mapping[str, Any]
@@ -179,12 +171,7 @@ def select_evaluation_settings(
     config: Mapping[str, Any], mode: str, groups_digest: str | None = None
 ) -> dict[str, Any]:
     """Return the settings that determine an evaluation's result, in addition to the run and its data.
-
-    Args:
-        config: the run's config.
-        mode: the evaluation mode.
-        groups_digest: digest of the file with the clip groups (`data.split.groups_file`); None without it.
-    """
+    `groups_digest` is the digest of the file with the clip groups (`data.split.groups_file`)."""
     chosen = config.get("evaluation", {})
     ik = chosen.get("ik", "off")
     solver = {"ik": ik} | ({"ik_iterations": chosen.get("ik_iterations")} if ik == "lbfgs" else {})
@@ -209,10 +196,8 @@ def select_evaluation_settings(
 
 
 def get_solver_name(settings: Mapping[str, Any]) -> str | None:
-    """Return the name of the inverse kinematics in evaluation settings, such as "arms"; None without one.
-
-    For L-BFGS, the name contains the number of iterations: "lbfgs-15".
-    """
+    """Return the name of the inverse kinematics in evaluation settings, such as "arms" or "lbfgs-15", or
+    None."""
     ik, iterations = settings.get("ik", "off"), settings.get("ik_iterations")
     if ik in (None, "off"):
         return None
@@ -316,10 +301,8 @@ def is_data_path(key: str) -> bool:
 
 
 def belongs_to_folder(run_id: str | None, folder: Path) -> bool:
-    """Return whether a file that records a run id is in the folder of that run.
-
-    A folder that is not named by an id is a copy of a run; all its files belong to it.
-    """
+    """Return whether a file that records a run id is in the folder of that run. A folder that is not named by
+    an id is a copy of a run; all its files belong to it."""
     return run_id in (None, folder.name) or not ID.fullmatch(folder.name)
 
 
@@ -329,10 +312,8 @@ def has_configured_inference(settings: Mapping[str, Any], config: Mapping[str, A
 
 
 def describe_export_difference(settings: Mapping[str, Any], config: Mapping[str, Any]) -> str:
-    """Return the export settings in which a deployment differs from the run's config, such as "naive-int8".
-
-    The text is empty without a difference. `export.graph=off` in the config counts as the default graph.
-    """
+    """Return the export settings in which a deployment differs from the run's config, such as "naive-int8",
+    or "". `export.graph=off` in the config counts as the default graph."""
     export = config.get("export") or {}
     own = {**export, "graph": "auto"} if export.get("graph") in ("off", False) else export
     exported = {key: settings.get(key, default) for key, default in EXPORTED.items()}

@@ -1,7 +1,4 @@
-"""Finds and describes runs in an outputs folder, and edits their tags and notes.
-
-Tags and notes are stored in the file `notes.json` of a run's folder. They do not affect its id.
-"""
+"""Finds and describes runs in an outputs folder, and edits their tags and notes, which do not affect ids."""
 
 from __future__ import annotations
 
@@ -30,11 +27,8 @@ def list_runs(outputs: Path | str) -> list[Run]:
 
 
 def find_run(outputs: Path | str, name: str) -> Run:
-    """Find a run by its id, the first digits of its id, or its folder.
-
-    Raises:
-        InputError: if no run or several runs match.
-    """
+    """Find a run by its id, the first digits of its id, or its folder. Raises InputError unless one run
+    matches."""
     is_folder = bool(name) and (Path(name) / "manifest.json").is_file()
     if is_folder and ("/" in name or not ID.fullmatch(name)):
         return Run(Path(name).resolve())
@@ -77,21 +71,14 @@ def describe_kind(kind: str) -> str:
 
 
 def get_run_name(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> str:
-    """Return a run's name, which shows how its config differs from the default config.
-
-    Args:
-        manifest: the run's manifest.
-        config: the run's config by dotted key; it is used if the manifest does not have a name.
-    """
+    """Return a run's name, which shows how its config (by dotted key) differs from the default config."""
     seed = "" if config.get("seed") is None else f" · seed {config['seed']}"
     return str(manifest.get("name") or describe_kind(str(manifest.get("kind") or "run")) + seed)
 
 
 def count_training_frames(run: Run) -> float:
-    """Return the number of frames that a run's network saw in all training steps; 0 if unknown.
-
-    For a refiner, the frames of the network that it refines are included.
-    """
+    """Return the number of frames that a run's network saw in all training steps, for a refiner including
+    those of the network that it refines; 0 if unknown."""
     config = run.config
     refiner, optim, model = (config.get(name) or {} for name in ("refiner", "optim", "model"))
     length = (refiner or model).get("frames") or 0
@@ -104,11 +91,8 @@ def count_training_frames(run: Run) -> float:
 
 
 def warn_if_hardly_trained(frames: float) -> str:
-    """Return a warning if a network saw less than half an hour of motion in training; otherwise "".
-
-    Args:
-        frames: the number of frames from `count_training_frames`; 0 if unknown.
-    """
+    """Return a warning if a network saw less than half an hour of motion in training (`frames`; 0 if
+    unknown)."""
     if not 0 < frames < LITTLE:
         return ""
     return f"hardly trained (its steps saw {frames / MINUTE:.2g} minutes of motion): ignore its errors"
@@ -120,12 +104,7 @@ MAX_LENGTH = 10_000  # characters of a note
 
 @dataclass(frozen=True)
 class Notes:
-    """A run's tags and note.
-
-    Attributes:
-        tags: the tags, sorted.
-        note: the note; may be empty.
-    """
+    """A run's sorted tags and its note, which may be empty."""
 
     tags: tuple[str, ...] = ()
     note: str = ""

@@ -21,14 +21,8 @@ TAIL_BYTES = 2**14  # searched for recent records
 
 
 class LogRecord(NamedTuple):
-    """One record of the log.
-
-    Attributes:
-        step: the number of finished training steps.
-        phase: "train" or "val".
-        values: values by name.
-        time: seconds since 1970, UTC.
-    """
+    """One record of the log, after `step` finished training steps. `phase` is "train" or "val"; `time` is
+    seconds since 1970, UTC."""
 
     step: int
     phase: str
@@ -60,12 +54,8 @@ class MetricsLog:
         self._whole = False
 
     def append(self, step: int, values: Mapping[str, float], phase: str) -> None:
-        """Append one line in a single write, so that a kill can damage only this line.
-
-        Raises:
-            LeaseLost: if another process has taken over the run.
-            OSError: if the disk is full; the log is then unchanged.
-        """
+        """Append one line in a single write, so that a kill can damage only this line. Raises LeaseLost if
+        another process has taken over the run, and OSError if the disk is full; the log is then unchanged."""
         check_owner(self.path)
         if not self._whole:
             self.repair()
@@ -79,23 +69,16 @@ class MetricsLog:
             self._whole = True
 
     def repair(self) -> None:
-        """Replace the log by a copy without an incomplete last line.
-
-        Later writes of an earlier owner go to the old file and are lost.
-        """
+        """Replace the log by a copy without an incomplete last line. Later writes of an earlier owner go to
+        the old file and are lost."""
         if self.path.exists():
             content = self.read_bytes()
             atomic_write(self.path, content[: content.rfind(b"\n") + 1])
         self._whole = True
 
     def read(self) -> list[LogRecord]:
-        """Return all records, without an incomplete last line.
-
-        If a resumed run repeated a step, the last record of the step is returned.
-
-        Raises:
-            InputError: if a line is damaged; the message names file and line.
-        """
+        """Return all records, without an incomplete last line. If a resumed run repeated a step, the step's
+        last record is returned. Raises InputError if a line is damaged; the message names file and line."""
         return list({(one.phase, one.step): one for one in self._parse(self.read_bytes())}.values())
 
     def read_tail(self) -> list[LogRecord]:
@@ -112,11 +95,8 @@ class MetricsLog:
         return _find_damage(self.path, found.st_mtime_ns, found.st_size)
 
     def read_bytes(self, start: int = 0) -> bytes:
-        """Return the log's content from a byte on, or the last bytes if `start` is negative.
-
-        Raises:
-            InputError: if the log is not a regular file, or too large.
-        """
+        """Return the log's content from a byte on, or the last bytes if `start` is negative. Raises
+        InputError if the log is not a regular file, or too large."""
         if not self.path.exists():
             return b""
         if not self.path.is_file() or (size := self.path.stat().st_size) > MAX_BYTES:

@@ -1,7 +1,5 @@
-"""Parses conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and collects the values of runs.
-
-A condition consists of comparisons, `and` and `or`; `and` binds more tightly.
-"""
+"""Parses conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and collects the values of runs. A
+condition consists of comparisons, `and` and `or`; `and` binds more tightly."""
 
 from __future__ import annotations
 
@@ -59,10 +57,8 @@ def build_record(run: Run) -> dict[str, Any]:
 
 
 def label_data(records: Sequence[Record]) -> list[str]:
-    """Return a label for each record's data: its name, with a short digest if the name is ambiguous.
-
-    The record of a VQ-VAE does not name its data; it gets the name from another record with the same data.
-    """
+    """Return a label for each record's data: its name, with a short digest if the name is ambiguous. The
+    record of a VQ-VAE does not name its data; it gets the name from another record with the same data."""
     digests = [str(one.get("data_digest") or "") for one in records]
     named = {
         digest: one["data.name"] for digest, one in zip(digests, records, strict=True) if "data.name" in one
@@ -76,16 +72,10 @@ def label_data(records: Sequence[Record]) -> list[str]:
 
 
 def list_differing_keys(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) -> list[str]:
-    """Return the config keys that can change a result and have different values in the configs.
-
-    If a slot has different options, only the slot is returned. Keys inside the slot are returned only if
-    configs with the same key have different values. Keys of the data are returned only if they differ between
-    data sets with the same name.
-
-    Args:
-        configs: the configs.
-        data: the data digest of each config.
-    """
+    """Return the config keys that can change a result and have different values in the configs. If a slot has
+    different options, only the slot is returned, and keys inside it only if configs with the same key have
+    different values. Keys of the data (`data`: each config's digest) are returned only if they differ between
+    data sets with the same name."""
     flats = [flatten(config) for config in configs]
     counting = {
         key for config in configs for key in select_training_config(config)
@@ -142,24 +132,16 @@ def check_key(key: str, records: Iterable[Record], option: str) -> None:
 
 
 class Query(NamedTuple):
-    """A parsed condition.
-
-    Attributes:
-        condition: a function that returns whether a record satisfies the condition.
-        keys: the keys in the condition.
-        numbers: the keys that are compared with <, <=, > or >=, so their values must be numbers.
-    """
+    """A parsed condition: a function of a record, the keys in it, and the keys in `numbers`, whose values
+    must be numbers because they are compared with <, <=, > or >=."""
 
     condition: Condition
     keys: tuple[str, ...]
     numbers: tuple[str, ...]
 
     def match_records(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
-        """Return, for each record, whether it satisfies the condition.
-
-        Raises:
-            InputError: if a key is unknown, or if a key in `numbers` has text values only.
-        """
+        """Return, for each record, whether it satisfies the condition. Raises InputError if a key is unknown,
+        or if a key in `numbers` has text values only."""
         for key in self.keys if records else ():
             check_key(key, records, option)
         for key in self.numbers:
@@ -233,10 +215,7 @@ class _Tokens:
 
 
 def _is_satisfied(actual: Any, sign: str, value: str) -> bool:
-    """Return whether a comparison is true.
-
-    With a missing value or NaN, comparisons with < and > are false.
-    """
+    """Return whether a comparison is true; with a missing value or NaN, < and > are false."""
     if sign in ORDER:
         number = _parse_number(value)
         comparable = isinstance(actual, int | float) and not isinstance(actual, bool)

@@ -52,22 +52,8 @@ def name_latency(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
 
 
 class Run:
-    """A run: the folder outputs/runs/<id>/.
-
-    Attributes:
-        folder: the folder; its name is the run's `id`.
-        id: 16 hex digits.
-        config_path: the file with the resolved config (`config`).
-        manifest_path: the file with facts about the run (`manifest`).
-        metrics_path: the file of the metrics log (`metrics()`).
-        checkpoint: the file of the last checkpoint.
-        model: the file of the trained weights.
-        picture: the picture of ground truth and prediction.
-        results_path: the file with the results of a VQ-VAE.
-        evaluations: the folder of evaluations.
-        deployments: the folder of deployments.
-        marker: the file that marks the run as done.
-    """
+    """A run: the folder outputs/runs/<id>/. An id has 16 hex digits. `results_path` has the results of a
+    VQ-VAE; `marker` marks the run as done."""
 
     STAGES = (*(f"deployments/*/{name}" for name in deployment_folder.FILES), "evaluations/*.json")
     """The files of a run's evaluations and deployments."""
@@ -134,11 +120,9 @@ class Run:
 
     @property
     def preferred_deployment(self) -> DeploymentFolder:
-        """The deployment for live use; it uses the network in the same way as the run's config.
-
-        The order of preference is: current component versions, an accurate int8 file, the export settings of
-        the config, the latest.
-        """
+        """The deployment for live use; it uses the network in the same way as the run's config. The order of
+        preference is: current component versions, an accurate int8 file, the export settings of the config,
+        the latest."""
         config = self.config
         return self._find_best_deployment(
             config,
@@ -154,11 +138,9 @@ class Run:
         return self.find_shown_deployment(self.config)
 
     def find_shown_deployment(self, config: Mapping[str, Any]) -> DeploymentFolder:
-        """Return the deployment with the measurements for tables, given the run's config.
-
-        The order of preference is: the export settings of the config, current component versions, exactly the
-        settings of the config, the latest. `name_latency` names different export settings.
-        """
+        """Return the deployment with the measurements for tables, given the run's config. The order of
+        preference is: the export settings of the config, current component versions, exactly the settings of
+        the config, the latest. `name_latency` names different export settings."""
         requested = select_deployment_settings(config)
         return self._find_best_deployment(
             config,
@@ -178,11 +160,8 @@ class Run:
     @property
     def preferred_onnx(self) -> Path:
         """The ONNX file for live use: int8 if it is accurate enough (`export.precision`), otherwise float32.
-
-        Raises:
-            InputError: if a finished run does not have an ONNX file (`export.graph=off`), or if the file has
-                changed since the export.
-        """
+        Raises InputError if a finished run does not have one (`export.graph=off`), or if it has changed since
+        the export."""
         deployment = self.preferred_deployment
         if self.done and not self.deployments.is_dir():
             make = join_command(["memmlp", "eval", str(self.folder), "export.graph=auto"])
@@ -204,14 +183,8 @@ class Run:
     def lock(
         self, report: Callable[[str], None] | None = None, wait: bool = True
     ) -> AbstractContextManager[Lease | None]:
-        """Hold the run's lock during the context, and yield the lease; a thread may lock a run repeatedly.
-
-        If another process takes over the run, any attempt of this process to write to it raises LeaseLost.
-
-        Args:
-            report: gets a line if this process has to wait; by default, the line goes to stderr.
-            wait: whether to wait while another process holds the lock. Without waiting, None is yielded.
-        """
+        """Hold the run's lock during the context, and yield the lease; see
+        `memmlp.common.lease.Lock.hold`."""
         return self._lock.hold(report, wait)
 
     @property
@@ -232,11 +205,9 @@ class Run:
         return None if self.done and word == "training" else word
 
     def state(self, complete: bool) -> str:
-        """Return the state of the run, given whether the caller considers it complete.
-
-        The states are: done, running (a process works on it), lost (its process died), failed, damaged (a
-        record cannot be read), trained (a requested evaluation or deployment is missing), stopped, new.
-        """
+        """Return the state of the run, given whether the caller considers it complete: done, running (a
+        process works on it), lost (its process died), failed, damaged (a record cannot be read), trained (a
+        requested evaluation or deployment is missing), stopped, new."""
         if complete and not self.damage:
             return "done"
         if (held := self._lock.is_held) is not None:
@@ -306,18 +277,10 @@ class Run:
     def begin(
         self, kind: str, config: Mapping[str, Any], *, data: str, prerequisite: str | None, **facts: Any
     ) -> None:
-        """Write config.yaml and the manifest of a run that starts or resumes.
-
-        If the code has uncommitted changes, a patch is written to the run's folder.
-
-        Args:
-            kind: the kind of the run (`Identity.kind`).
-            config: the resolved config.
-            data: digest of the prepared data.
-            prerequisite: id of the run that provides weights for this run.
-            facts: further manifest entries, such as component versions, device, threads, `prerequisite_runs`
-                (their origins) and `plugins` (the user's packages).
-        """
+        """Write config.yaml and the manifest of a run that starts or resumes, and a patch of uncommitted
+        changes of the code. `kind` is that of `Identity`, `data` the digest of the prepared data,
+        `prerequisite` the id of the run that provides weights. `facts` are further manifest entries, such as
+        component versions, device and threads."""
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
         if patch := create_code_patch():
@@ -348,11 +311,8 @@ class Run:
         self.write_manifest({"attempts": [*self.manifest.get("attempts", []), attempt]})
 
     def write_manifest(self, fields: Mapping[str, Any]) -> None:
-        """Add fields to the manifest, or replace them.
-
-        Raises:
-            InputError: if the existing manifest can't be read, since its content would be lost.
-        """
+        """Add or replace fields of the manifest. Raises InputError if it can't be read, since its content
+        would be lost."""
         manifest = records.load(self.manifest_path, records.Manifest)
         write_json(self.manifest_path, manifest | dict(fields))
 
@@ -363,26 +323,15 @@ class Run:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved config; empty before the run began.
-
-        Raises:
-            InputError: if the file is damaged.
-        """
+        """The resolved config; empty before the run began. Raises InputError if the file is damaged."""
         return records.load(self.config_path, records.Config)
 
     @property
     def results(self) -> dict[str, Any]:
-        """The results with the run's own settings: mode -> branch -> metric, and "latency".
-
-        If the exported file differs from the requested file, the key names the difference: "latency-int8",
-        "latency-naive" (`find_shown_deployment`).
-
-        Of several kinds of inverse kinematics, the kind in the run's config counts, or else the last kind.
-        The results of a VQ-VAE have other keys.
-
-        Raises:
-            InputError: if an evaluation file is damaged.
-        """
+        """The results with the run's own settings: mode -> branch -> metric, and "latency". If the exported
+        file differs from the requested one, the key names the difference: "latency-int8". Of several kinds of
+        inverse kinematics, the kind in the run's config counts, or else the last kind. The results of a
+        VQ-VAE have other keys. Raises InputError if an evaluation file is damaged."""
         results = records.read(self.results_path, records.Tree) | self.configured_evaluations.results
         config = self.config
         deployed = self.find_shown_deployment(config)
@@ -395,10 +344,8 @@ class Run:
 
     @property
     def changed_sources(self) -> list[str]:
-        """The code files that have changed since the run began; empty if unknown.
-
-        Files of the user's packages are included if the packages are found.
-        """
+        """The code files, also of users' packages, that have changed since the run began; empty if
+        unknown."""
         return list_changed_files(self.manifest)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
@@ -458,11 +405,7 @@ class Run:
         return records.read(self.marker, records.Marker).get("artifacts", {}).get(self.model.name)
 
     def weights(self) -> Path:
-        """Return the file of the trained weights, after checking its digest.
-
-        Raises:
-            InputError: if the file has changed since the training.
-        """
+        """Return the file of the trained weights. Raises InputError if it has changed since the training."""
         digest = self.weights_digest
         if digest and not self._same(self.model.name, digest):
             raise InputError(f"{self.model}: changed since the training; repeat the run with force=true")

@@ -32,12 +32,8 @@ class MeasurableTask(Protocol):
 
 
 class StepCompute(NamedTuple):
-    """The FLOPs of a training step. A FLOP is one multiplication or addition of a matrix product.
-
-    Attributes:
-        network: FLOPs of network and loss, forward and backward, with a rollout's calls.
-        optimiser: FLOPs of the optimiser; 0 for AdamW, while Muon multiplies matrices.
-    """
+    """The FLOPs of a training step: of `network` and loss, forward and backward, with a rollout's calls, and
+    of the `optimiser` (0 for AdamW). A FLOP is one multiplication or addition of a matrix product."""
 
     network: float
     optimiser: float
@@ -49,10 +45,8 @@ class StepCompute(NamedTuple):
 
 
 def measure_step(task: MeasurableTask, optim: Optim) -> StepCompute:
-    """Count the FLOPs of a training step by taking a step, then restore the module.
-
-    The count does not depend on the device: kernels that hide their matrix products are switched off.
-    """
+    """Count the FLOPs of a training step by taking a step, then restore the module. The count does not depend
+    on the device: kernels that hide their matrix products are switched off."""
     before = copy.deepcopy(task.module.state_dict())
     task.module.train()
 

@@ -17,15 +17,10 @@ DEFAULT_THREADS = min(torch.get_num_threads(), count_usable_cores())  # before a
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the torch device with a given name: auto, cpu, cuda, cuda:INDEX or mps.
-
-    The name auto selects a CUDA GPU if there is one, and the CPU otherwise. If several processes train one
-    run together, process N uses GPU N. On a GPU, TF32 is switched off: by default cuDNN rounds the factors in
-    GRUs and LSTMs to ten bits.
-
-    Raises:
-        InputError: if the device does not exist.
-    """
+    """Return the torch device with a name: auto (a CUDA GPU if there is one), cpu, cuda, cuda:INDEX or mps.
+    If several processes train one run together, process N uses GPU N. On a GPU, TF32 is switched off: by
+    default cuDNN rounds the factors in GRUs and LSTMs to ten bits. Raises InputError if the device does not
+    exist."""
     kind, _, index = name.partition(":")
     if kind == "mps" and not torch.backends.mps.is_available():
         raise InputError(f"device={name}: must be cpu or auto, since torch does not find an Apple GPU")
@@ -47,11 +42,8 @@ def choose_device(name: str) -> torch.device:
 
 
 def describe_device(device: torch.device) -> dict[str, Any]:
-    """Return a device's kind, GPU name and GPU index for a manifest.
-
-    If CUDA_VISIBLE_DEVICES is set, `gpu_index` is the GPU's entry there, because the process renumbers the
-    visible GPUs.
-    """
+    """Return a device's kind, GPU name and GPU index for a manifest. If CUDA_VISIBLE_DEVICES is set,
+    `gpu_index` is the GPU's entry there, because the process renumbers the visible GPUs."""
     if device.type != "cuda":
         return {"device": device.type, "gpu": None, "gpu_index": None}
     index = torch.cuda.current_device() if device.index is None else device.index
@@ -61,10 +53,7 @@ def describe_device(device: torch.device) -> dict[str, Any]:
 
 
 def use_threads(number: int) -> None:
-    """Set torch's number of CPU threads; 0 restores torch's default.
-
-    One process may perform several runs with different settings.
-    """
+    """Set torch's number of CPU threads; 0 restores torch's default."""
     torch.set_num_threads(number or DEFAULT_THREADS)
 
 

@@ -29,13 +29,8 @@ from memmlp.training.optim import Average, Optim
 
 @dataclass(frozen=True)
 class StepResult:
-    """The results of a training step.
-
-    Attributes:
-        loss: the loss, a scalar.
-        terms: the loss's unweighted terms by name.
-        clips: clip index of each sample (B,).
-    """
+    """The results of a training step: the scalar `loss`, its unweighted terms by name, and the samples' clips
+    (B,)."""
 
     loss: Tensor
     terms: dict[str, Tensor]
@@ -43,12 +38,8 @@ class StepResult:
 
 
 class TrainingTask:
-    """A task for the training loop: a module with a loss and data.
-
-    Attributes:
-        module: the module to train; checkpoints hold its parameters and buffers.
-        dataset: the training split of the dataset.
-    """
+    """A task for the training loop: a module with a loss and data. Checkpoints hold the module's parameters
+    and buffers."""
 
     module: nn.Module
     dataset: MotionDataset
@@ -91,24 +82,11 @@ def train(
     description: str,
     on_validation: ValidationCallback | None = None,
 ) -> None:
-    """Train for `optim.steps` or `optim.tflop`, starting from the run's checkpoint if there is one.
-
-    The last checkpoint stays in the run's folder. The module is left with the final weights, which may be an
-    average over steps, or the best ones on validation. The run's manifest records the number of steps and the
-    compute.
-
-    Args:
-        task: what to train.
-        settings: steps, learning rates and intervals.
-        run: the run; its folder receives checkpoints and the metrics log.
-        seed: the seed of all steps.
-        description: label of the progress bar.
-        on_validation: called after each validation; see ValidationCallback.
-
-    Raises:
-        TrainingDiverged: if the loss is NaN or infinite.
-        InputError: if several processes would not give the same result as one process.
-    """
+    """Train for `optim.steps` or `optim.tflop`, starting from the run's checkpoint if there is one. The last
+    checkpoint stays in the run's folder. The module is left with the final weights, which may be an average
+    over steps, or the best ones on validation. The manifest records the number of steps and the compute.
+    `on_validation` is called after each validation. Raises TrainingDiverged if the loss is NaN or infinite,
+    and InputError if several processes would not give the same result as one process."""
     check_processes(task, settings, description)
     settings = plan_steps(task, settings, run, description)
     optimiser = settings.build(task.parameter_groups())
@@ -256,10 +234,8 @@ def save(
     step: int,
     seconds: float,
 ) -> None:
-    """Write a checkpoint after `step` steps and `seconds` of training.
-
-    The first process writes it; the other processes copy the weights of the first process.
-    """
+    """Write a checkpoint after `step` steps and `seconds` of training; processes other than the first copy
+    its weights."""
     distributed.copy_from_first(task.module)
     if not distributed.is_first():
         return
@@ -298,15 +274,9 @@ def resume(
 
 
 class BestWeights:
-    """The weights with the lowest MPJPE of a branch on validation. A checkpoint holds them, too.
-
-    Args:
-        module: the module that is trained.
-        branch: "rotation" or "position"; None keeps the last weights.
-
-    Attributes:
-        step: the step of the kept weights; 0 before the first validation, and without a branch.
-    """
+    """The weights with the lowest MPJPE of a branch on validation; without a branch, the last weights. A
+    checkpoint holds them, too. `step` is that of the kept weights; 0 before the first validation, and without
+    a branch."""
 
     def __init__(self, module: nn.Module, branch: str | None):
         self.module, self.metric = module, f"{branch} MPJPE" if branch else None
@@ -314,11 +284,8 @@ class BestWeights:
         self.weights: dict[str, Tensor] = {}
 
     def update(self, step: int, values: dict[str, float], average: Average) -> None:
-        """Keep a copy of the final weights (see Average) if their error is the lowest so far.
-
-        Raises:
-            InputError: if the branch's error is not among the validation's values.
-        """
+        """Keep a copy of the final weights (see Average) if their error is the lowest so far. Raises
+        InputError if the branch's error is not among the validation's values."""
         if self.metric is None:
             return
         if self.metric not in values:

@@ -127,16 +127,10 @@ class ScheduleFreeSettings(OptimSettings):
 
 @dataclass(frozen=True)
 class Optim:
-    """The optimisation of a module: by AdamW, or by the optimiser of a subclass.
-
-    Attributes that are not listed are keys of AdamWSettings.
-
-    Attributes:
-        batch: windows per step; for a VQ-VAE, frames per step.
-        schedule: a name in SCHEDULES; "milestones" is for VQ-VAEs (App. A).
-        betas: Adam's two decay rates.
-        decoupled: whether weight decay is decoupled, as in AdamW.
-    """
+    """The optimisation of a module: by AdamW, or by the optimiser of a subclass. Attributes that are not keys
+    of AdamWSettings: `batch`, windows (VQ-VAE: frames) per step; `schedule`, a name in SCHEDULES, of which
+    "milestones" is for VQ-VAEs (App. A); `betas`, Adam's decay rates; `decoupled`, whether weight decay is
+    decoupled."""
 
     steps: int
     batch: int
@@ -160,23 +154,14 @@ class Optim:
     validation_pieces: int | None = None
 
     def with_lr(self, lr: float | None) -> Self:
-        """Return a copy with another initial learning rate; the final rate is scaled by the same factor.
-
-        Args:
-            lr: initial learning rate; None changes nothing.
-        """
+        """Return a copy with another initial learning rate and a proportional final rate; None changes
+        nothing."""
         return self if lr is None else replace(self, lr=lr, final_lr=self.final_lr * lr / self.lr)
 
     def resolve(self, step_tflop: float, spent: float | None = 0.0) -> Self:
-        """Return a copy with whole numbers of steps, instead of a compute budget and fractions.
-
-        Args:
-            step_tflop: the compute of a training step, TFLOP.
-            spent: the compute of the prerequisite runs, TFLOP; None if unknown.
-
-        Raises:
-            InputError: if the budget `tflop` is too small for a step, or `spent` is unknown.
-        """
+        """Return a copy with whole numbers of steps, instead of a compute budget and fractions. `step_tflop`
+        is the compute of a training step, `spent` that of the prerequisite runs. Raises InputError if the
+        budget `tflop` is too small for a step, or `spent` is unknown."""
         steps = self.steps
         if self.tflop is not None and spent is None:
             raise InputError(
@@ -218,12 +203,9 @@ class Optim:
 
 @dataclass(frozen=True)
 class Muon(Optim):
-    """Optimisation by Muon for matrices, and by AdamW for all other parameters (Jordan et al. 2024).
-
-    Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025). AdamW's learning rates
-    and weight decay therefore suit both. Like torch.optim.Muon, it multiplies matrices in bfloat16 and uses
-    Nesterov momentum. The attributes are the keys of MuonSettings.
-    """
+    """Optimisation by Muon for matrices, and by AdamW for all other parameters (Jordan et al. 2024). Muon's
+    steps are scaled to the typical length of AdamW's (Liu et al. 2025), so AdamW's learning rates and weight
+    decay suit both. Like torch.optim.Muon, it multiplies in bfloat16 and uses Nesterov momentum."""
 
     momentum: float = 0.95
     other_lr: float | None = None
@@ -256,11 +238,8 @@ class Muon(Optim):
 
 @dataclass(frozen=True)
 class ScheduleFree(Optim):
-    """Optimisation by schedule-free AdamW (Defazio et al. 2024) of the package schedulefree.
-
-    It averages the weights itself, and its only schedule is the warm-up: `schedule`, `final_lr`, `drop_at`
-    and `ema` have no effect.
-    """
+    """Optimisation by schedule-free AdamW (Defazio et al. 2024) of the package schedulefree. It averages the
+    weights itself; `schedule`, `final_lr`, `drop_at` and `ema` have no effect."""
 
     def compute_factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of `lr`."""
@@ -299,9 +278,7 @@ def _split_matrices(groups: list[dict], least: int) -> tuple[list[dict], list[di
 
 def make_vqvae_optim(steps: int, **keys: Any) -> Optim:
     """Make a VQ-VAE's optimisation: Adam; its rate is multiplied by 0.2 at 20, 50 and 70 % of the steps.
-
-    Validation is done once, at the end; `keys` are further attributes of Optim.
-    """
+    Validation is done once, at the end; `keys` are further attributes of Optim."""
     return Optim(
         steps, schedule="milestones", betas=(0.9, 0.99), decoupled=False, validate_every=steps, **keys
     )
@@ -332,11 +309,7 @@ class BatchedMuon(getattr(torch.optim, "Muon", Optimizer)):  # type: ignore[misc
 
 def orthogonalise(matrices: Tensor, group: Mapping[str, Any]) -> Tensor:
     """Return nearly orthogonal matrices (B, m, n), bfloat16, by torch.optim.Muon's Newton-Schulz iteration.
-
-    Args:
-        matrices: the matrices (B, m, n).
-        group: a parameter group of torch.optim.Muon, with the iteration's settings.
-    """
+    `group` is a parameter group of torch.optim.Muon, with the iteration's settings."""
     a, b, c = group["ns_coefficients"]
     tall = matrices.shape[1] > matrices.shape[2]
     x = matrices.bfloat16().mT if tall else matrices.bfloat16()
@@ -348,11 +321,8 @@ def orthogonalise(matrices: Tensor, group: Mapping[str, Any]) -> Tensor:
 
 
 class ComposedOptimiser(Optimizer):
-    """One optimiser made of several, with all their parameter groups and states.
-
-    Args:
-        parts: the optimisers; they must not share parameters.
-    """
+    """One optimiser made of several, with all their parameter groups and states; they must not share
+    parameters."""
 
     def __init__(self, parts: Sequence[Optimizer]):
         self.parts = tuple(parts)
@@ -380,11 +350,9 @@ class ComposedOptimiser(Optimizer):
 
 
 class Float32Products(TorchFunctionMode):
-    """A context that computes products of bfloat16 matrices on the CPU in float32, then rounds them.
-
-    A processor without bfloat16 instructions is six times slower in bfloat16 than in float32. The results are
-    equal: products of two bfloat16 numbers are exact in float32, and sums are in float32 with both methods.
-    """
+    """A context that computes products of bfloat16 matrices on the CPU in float32, then rounds them. Without
+    bfloat16 instructions this is six times faster. The results are equal: products of two bfloat16 numbers
+    are exact in float32, and sums are in float32 with both methods."""
 
     def __torch_function__(
         self,
@@ -393,7 +361,6 @@ class Float32Products(TorchFunctionMode):
         args: Sequence[Any] = (),
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:
-        """Call a function of torch."""
         if func in MATRIX_PRODUCTS and all(map(_is_bfloat16_on_cpu, args)):
             return func(*(tensor.float() for tensor in args), **(kwargs or {})).bfloat16()
         return func(*args, **(kwargs or {}))
@@ -417,15 +384,10 @@ def _is_bfloat16_on_cpu(tensor: Any) -> bool:
 
 
 class Average:
-    """The final weights of a module, which are validated and kept after the training.
-
-    In this base class the weights of the last step are the final weights; a subclass may average over the
-    steps. A checkpoint holds both, so a resumed training continues exactly. Only parameters are averaged.
-    Buffers, such as a codebook's statistics, keep the last step's values.
-
-    Args:
-        module: the module that is trained.
-    """
+    """The final weights of a module, which are validated and kept after the training. In this base class
+    these are the weights of the last step; a subclass may average over the steps. A checkpoint holds both, so
+    a resumed training continues exactly. Only parameters are averaged; buffers, such as a codebook's
+    statistics, keep the last step's values."""
 
     def __init__(self, module: nn.Module):
         self.parameters = dict(module.named_parameters())
@@ -460,15 +422,9 @@ class Average:
 
 
 class EMA(Average):
-    """An exponential moving average of the weights.
-
-    The decay first grows as (1 + steps) / (10 + steps), so that the random initial weights are soon
-    forgotten.
-
-    Args:
-        module: the module that is trained.
-        decay: the fraction of the old average that each step keeps, in (0, 1).
-    """
+    """An exponential moving average of the weights; each step keeps the fraction `decay` in (0, 1) of the old
+    average. The decay first grows as (1 + steps) / (10 + steps), so that the random initial weights are soon
+    forgotten."""
 
     def __init__(self, module: nn.Module, decay: float):
         super().__init__(module)
@@ -492,12 +448,7 @@ class EMA(Average):
 
 
 class ScheduleFreeAverage(Average):
-    """The average that a schedule-free optimiser maintains; its evaluation mode writes it into the module.
-
-    Args:
-        module: the module that is trained.
-        optimiser: an optimiser of the package schedulefree, in its training mode.
-    """
+    """The average that a schedule-free optimiser maintains; its evaluation mode writes it into the module."""
 
     COUNTERS = ("k", "weight_sum", "lr_max")
     """The counters in the optimiser's groups: steps, sum of the average's weights, largest learning rate."""

@@ -29,12 +29,7 @@ LOW_RATE = 0.99  # of the network's rate; 59.94 Hz counts as 60
 
 @dataclass(frozen=True)
 class RunRequest:
-    """A run requested by a config, with its prerequisite runs and the stages after its training.
-
-    Attributes:
-        config: the resolved config.
-        motion: the source of the motion.
-    """
+    """A run requested by a resolved config, with its prerequisite runs and the stages after its training."""
 
     config: dict[str, Any]
     motion: MotionSource
@@ -76,11 +71,8 @@ class RunRequest:
 
     @cached_property
     def _run_chain(self) -> list[tuple[str, dict[str, Any]]]:
-        """The kind and the identifying config of each required run, in training order.
-
-        The identity of a frozen VQ-VAE's run covers its config. A joint VQ-VAE is trained with the network:
-        only the keys of its architecture have an effect.
-        """
+        """The kind and the identifying config of each required run, in training order. A frozen VQ-VAE's run
+        covers its config; of a joint VQ-VAE, only the keys of its architecture count."""
         config, codes = self.config, find_vqvae_training(self.config)
         network_config = {key: value for key, value in config.items() if key != "vqvae"}
         if codes == "joint":
@@ -110,14 +102,9 @@ def remove_refiner(config: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a request.
-
-    Attributes:
-        run: the network's run.
-        new_stages: the stages that this call ran, out of "training", "evaluation" and "deployment".
-        results: mode -> branch -> metric, and "latency".
-        stage_ids: the ids of the evaluations and the deployment that the results come from.
-    """
+    """The result of a request: the network's run, the stages ("training", "evaluation", "deployment") that
+    this call ran, the results (mode -> branch -> metric, and "latency"), and the ids of the stages that they
+    come from."""
 
     run: Run
     new_stages: tuple[str, ...]
@@ -148,10 +135,8 @@ def announce_data(data: PreparedMotion) -> None:
 
 
 def list_missing_modes(request: RunRequest, run: Run) -> list[str]:
-    """Return the modes to evaluate: missing modes, and modes whose custom metrics have new code.
-
-    A package's code may change without a new component version. Its metrics are then measured again.
-    """
+    """Return the modes to evaluate: missing modes, and modes whose custom metrics have new code, which a
+    package may change without a new component version."""
     return [
         mode
         for mode, name in request.evaluations.items()
@@ -215,15 +200,8 @@ def describe_test_clips(clips: Sequence[ClipRecord]) -> str:
 
 
 def describe_low_rates(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
-    """Return a remark on linearly interpolated clips with a low frame rate; None without such clips.
-
-    Linear interpolation makes kinks in the motion.
-
-    Args:
-        manifest: the data's manifest.
-        clips: the clips to check.
-        what: the name of the clips in the remark, such as "test clips".
-    """
+    """Return a remark on linearly interpolated clips with a low frame rate, which makes kinks in the motion,
+    or None. `what` names the clips, such as "test clips"."""
     rates = sorted(clip.fps for clip in clips if clip.fps < LOW_RATE * FPS)
     if not rates or manifest.interpolation != LINES:
         return None
@@ -254,12 +232,7 @@ def describe_unusual_clips(unusual: Mapping[str, str]) -> str | None:
 
 
 def collect_data_warnings(config: Mapping[str, Any], data: PreparedMotion) -> dict[str, Any]:
-    """Return warnings about a run's data by name, for tables; None where a warning does not apply.
-
-    Args:
-        config: the run's config.
-        data: the run's prepared data.
-    """
+    """Return warnings about a run's data by name, for tables; None where a warning does not apply."""
     manifest = data.manifest
     tested = [clip for clip in manifest.clips if clip.split == "test"]
     names = [clip.name for clip in tested if clip.name in manifest.unusual]

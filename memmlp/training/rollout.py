@@ -1,8 +1,7 @@
 """The rollout slot: draws a step's training batch, and provides the history that the network sees.
 
 A network that is trained only on true history learns to rely on it, but does not have it at run time
-(exposure bias). A rollout can therefore let the network predict its own history, as in a live stream.
-"""
+(exposure bias). A rollout can therefore let the network predict its own history, as in a live stream."""
 
 from __future__ import annotations
 
@@ -22,14 +21,8 @@ from memmlp.networks.motion_model import MotionModel, State
 
 
 class TrainingCall(NamedTuple):
-    """The arguments of `MotionModel.compute_training_outputs` for one training step.
-
-    Attributes:
-        sparse: world inputs (B, n, 54) of the new frames.
-        state: the state before the new frames.
-        true_frames: world frames [X | Theta] (B, T, 252) of the window.
-        clips: clip index of each sample (B,).
-    """
+    """The arguments of `MotionModel.compute_training_outputs`: world inputs (B, n, 54) of the new frames, the
+    state before them, world frames [X | Theta] (B, T, 252) of the window, and the samples' clips (B,)."""
 
     sparse: Tensor
     state: State
@@ -38,10 +31,7 @@ class TrainingCall(NamedTuple):
 
 
 class Rollout(nn.Module):
-    """The rollout slot's interface.
-
-    If several processes share a batch, each process draws only its own rows (memmlp.common.distributed).
-    """
+    """The rollout slot's interface. If several processes share a batch, each draws only its own rows."""
 
     def begin(self, model: MotionModel) -> None:
         """Prepare buffers that stay between a network's training steps; by default there are no buffers."""
@@ -88,11 +78,9 @@ class OwnPredictionsSettings(Settings):
 
 
 class OwnPredictions(Rollout):
-    """A rollout with predicted history, from 0 to `max_passes` earlier calls without gradients.
-
-    The first call sees an empty history. Each call fills one stride of the history. All samples of a step use
-    the same number of calls.
-    """
+    """A rollout with predicted history, from 0 to `max_passes` earlier calls without gradients. The first
+    call sees an empty history. Each call fills one stride. All samples of a step use the same number of
+    calls."""
 
     def __init__(self, max_passes: int):
         super().__init__()
@@ -139,20 +127,11 @@ class StreamsSettings(Settings):
 
 
 class PersistentStreams(Rollout):
-    """A rollout with many streams, which run through the clips during the whole training.
-
-    Every stream predicts its own history. Every step advances the next `batch` streams by one stride. A
-    stream starts at a random frame of a clip. At the clip's end it restarts at the beginning of another clip,
-    which preserves the sampler's window frequencies. The streams' states are part of the checkpoint.
-
-    Args:
-        streams: number of streams.
-
-    Attributes:
-        clip: index of each stream's clip (streams,).
-        end: index of each stream's newest frame in that clip (streams,).
-        lives: whether each stream has started (streams,).
-    """
+    """A rollout with many streams, which run through the clips during the whole training and predict their
+    own history. Every step advances the next `batch` streams by one stride. A stream starts at a random frame
+    of a clip. At the clip's end it restarts at the beginning of another clip, which preserves the sampler's
+    window frequencies. The streams' states are part of the checkpoint: clip index, newest frame in that clip,
+    and whether the stream has started (streams,)."""
 
     clip: Tensor
     end: Tensor
@@ -173,10 +152,8 @@ class PersistentStreams(Rollout):
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
-        """Draw the batch of a training step: the next streams, each advanced by one stride.
-
-        Call `keep` before the next draw: it stores the new states of the streams that were drawn last.
-        """
+        """Draw the next streams, each advanced by one stride. Call `keep` before the next draw: it stores the
+        new states of the streams that were drawn last."""
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
         again = sampler.draw_stream_starts(step, model.stride)

@@ -1,7 +1,5 @@
-"""Run an experiment: data, prerequisite runs, the network's run, evaluations and deployment.
-
-Each stage has an id (memmlp.runs.identity). A stage with an existing id is reused; other stages are run.
-"""
+"""Run an experiment: data, prerequisite runs, the network's run, evaluations and deployment. A stage whose id
+(memmlp.runs.identity) exists is reused."""
 
 from __future__ import annotations
 
@@ -58,19 +56,9 @@ from memmlp.training.train_refiner import RefinerTraining
 
 @dataclass(frozen=True)
 class Experiment(RunRequest):
-    """A request with the built objects that its runs need.
-
-    Attributes:
-        device: device of training and evaluation.
-        architecture: builds the networks.
-        prerequisites: the trainings of the prerequisite runs; each training uses the run before it.
-        training: the network's training.
-        evaluation: the network's evaluation.
-        deployment: the network's export and timing; None without a deployment.
-        loggers: report the runs to other programs, such as MLflow.
-        make_name: makes a readable name for a run from its kind and its config.
-        unrefined: the experiment of the network without its refiner; None without a refiner.
-    """
+    """A request with the built objects that its runs need. Each of the `prerequisites` uses the run before
+    it. `make_name` makes a readable name for a run from its kind and its config. `unrefined` is the
+    experiment of the network without its refiner; None without a refiner."""
 
     device: torch.device
     architecture: Architecture
@@ -84,14 +72,9 @@ class Experiment(RunRequest):
 
 
 def run_in_processes(experiment: Experiment) -> Outcome | None:
-    """Run the experiment in this process, or together with the other processes of torchrun.
-
-    The first process holds the run's lock, prepares the data, writes files, evaluates and deploys. It
-    broadcasts to the other processes which stage to train next.
-
-    Returns:
-        The outcome in the first process, None in the others.
-    """
+    """Run the experiment in this process, or together with the other processes of torchrun; return the
+    outcome in the first process, None in the others. The first process holds the run's lock, prepares the
+    data, writes files, evaluates and deploys. It broadcasts which stage to train next."""
     if experiment.unrefined and distributed.world_size() > 1:
         raise InputError("refiner: must be null with several processes; or start one process")
     distributed.connect(experiment.device.type)
@@ -118,12 +101,8 @@ def _train_named_stages(experiment: Experiment) -> None:
 
 
 def run_experiment(experiment: Experiment, on_validation: ValidationCallback | None = None) -> Outcome:
-    """Run the missing stages of the experiment.
-
-    Args:
-        experiment: what to run.
-        on_validation: called after each validation with the step and its values; it may raise to end the run.
-    """
+    """Run the missing stages of the experiment. `on_validation` is called after each validation with the step
+    and its values; it may raise to end the run."""
     config = experiment.config
     data = experiment.motion.prepare()
     announce_data(data)
@@ -159,17 +138,8 @@ def run_experiment(experiment: Experiment, on_validation: ValidationCallback | N
 def complete_stages(
     experiment: Experiment, run: Run, data: PreparedMotion, again: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """Run the missing evaluations and deployment of a trained run, and return its results.
-
-    Args:
-        experiment: defines the evaluations and the deployment.
-        run: the trained run.
-        data: the prepared motion.
-        again: whether to repeat existing evaluations.
-
-    Returns:
-        The results, and the names of the stages that were run.
-    """
+    """Run the missing evaluations (with `again`, all) and deployment of a trained run; return its results and
+    the names of the stages that were run."""
     with run.lock(), record_outcome(experiment, run, again):
         if again:
             evaluate_run(experiment, run, data, experiment.evaluation.modes)
@@ -178,11 +148,8 @@ def complete_stages(
 
 
 def make_missing_stages(experiment: Experiment, run: Run, data: PreparedMotion) -> list[str]:
-    """Run the missing evaluations and deployment of a trained run.
-
-    Returns:
-        The names of the stages that were run.
-    """
+    """Run the missing evaluations and deployment of a trained run; return the names of the stages that were
+    run."""
     new_stages = []
     run.request_stages(experiment.stage_ids)
     if missing := list_missing_modes(experiment, run):
@@ -197,13 +164,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: PreparedMotion) 
 
 
 def make_prerequisites(experiment: Experiment, data: PreparedMotion, last: str | None = None) -> Run | None:
-    """Train the missing prerequisite runs in order; return the last run, or None without prerequisites.
-
-    Args:
-        experiment: the experiment.
-        data: the prepared motion.
-        last: the id of the run to stop at; by default the last one.
-    """
+    """Train the missing prerequisite runs in order, up to the run id `last`; return the last run, or None."""
     if experiment.unrefined:
         return run_experiment(experiment.unrefined).run
     run: Run | None = None
@@ -241,11 +202,8 @@ def find_or_train(
 
 @contextlib.contextmanager
 def record_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
-    """Report work on a run to the loggers, and record failures in the run's folder.
-
-    Only failures of the work itself are recorded. Bad input, interruptions, a full disk, a closed output
-    pipe, and the loss of the run to another process are not recorded.
-    """
+    """Report work on a run to the loggers, and record failures of the work itself in the run's folder: not
+    bad input, interruptions, a full disk, a closed output pipe, or the loss of the run to another process."""
     missing = again or not run.done or not all(map(run.has, experiment.stage_ids))
     missing = missing or bool(list_missing_modes(experiment, run))
     loggers = experiment.loggers if missing else Loggers((), experiment.outputs)
@@ -287,10 +245,7 @@ def train_run(
 
 
 def evaluate_run(experiment: Experiment, run: Run, data: PreparedMotion, modes: Sequence[str]) -> None:
-    """Evaluate a trained run in the given modes.
-
-    Each evaluation is one file, which is written atomically. The picture is drawn once.
-    """
+    """Evaluate a trained run in the given modes, as one file each. The picture is drawn once."""
     run.attempt("evaluation")
     announce(f"evaluation: measure the errors on the test clips, in {' and '.join(modes)} mode")
     with record_time(run, "evaluate"):
@@ -344,10 +299,8 @@ def deploy_run(experiment: Experiment, run: Run, data: PreparedMotion) -> None:
 def begin_run(
     experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any], before: Run | None
 ) -> None:
-    """Begin a training: write its config, and record its identity and the machine in the manifest.
-
-    The manifest also has the origin of the prerequisite run's weights (`before`).
-    """
+    """Begin a training: write its config, and record its identity, the machine, and the origin of the
+    prerequisite run's weights (`before`) in the manifest."""
     above = identity.prerequisite
     counting: Mapping[str, Any] = {**(above.config if above else {}), **identity.config}
     facts = {

@@ -21,12 +21,8 @@ WARM_UP = 3  # steps before the first round; torch.compile works in the first on
 
 
 class ProductRecorder(TorchDispatchMode):
-    """A context that records the matrix products within it: the calls that torch's FLOP counter counts.
-
-    Attributes:
-        calls: functions with their arguments, in order.
-        flops: number of floating-point operations of all calls.
-    """
+    """A context that records its matrix products: the `calls` that torch's FLOP counter counts, with
+    arguments, in order, and their `flops`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -36,7 +32,6 @@ class ProductRecorder(TorchDispatchMode):
     def __torch_dispatch__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
-        """Call a function of torch, and record it if it is a matrix product."""
         result = func(*args, **(kwargs or {}))
         if count := flop_registry.get(func.overloadpacket):
             self.calls.append((func, args, kwargs or {}))
@@ -52,15 +47,9 @@ class ProductRecorder(TorchDispatchMode):
 
 @dataclass(frozen=True)
 class StepCost:
-    """The processor time of a training step on one thread.
-
-    Attributes:
-        step_ms: milliseconds per step in each round (rounds,).
-        product_ms: milliseconds of the step's matrix products alone in each round (rounds,).
-        flops: number of floating-point operations in the products of a step.
-        kernels: torch's functions, the slowest first: name, milliseconds and calls per step. Empty unless
-            they are profiled.
-    """
+    """The processor time of a training step on one thread: milliseconds per step and of its matrix products
+    alone in each round (rounds,), FLOPs of these products, and torch's functions, slowest first (name,
+    milliseconds and calls per step; empty unless profiled)."""
 
     step_ms: np.ndarray
     product_ms: np.ndarray
@@ -76,17 +65,8 @@ class StepCost:
 def measure_step_cost(
     task: TrainingTask, optim: Optim, rounds: int, steps: int, with_kernels: bool = False
 ) -> StepCost:
-    """Measure the processor time of training steps on one thread of the CPU.
-
-    Each round times some steps, then as many replays of one step's products. The median of a round counts.
-
-    Args:
-        task: the training task, on the CPU.
-        optim: its optimisation.
-        rounds: number of rounds.
-        steps: number of steps in a round.
-        with_kernels: whether to profile torch's functions.
-    """
+    """Measure the processor time of training steps on one thread of the CPU. Each of the `rounds` times some
+    steps, then as many replays of one step's products; the median of a round counts."""
     optimiser = optim.build(task.parameter_groups())
     average = optim.make_average(task.module, optimiser)
     done = 0

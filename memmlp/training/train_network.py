@@ -30,11 +30,7 @@ VALIDATION_PIECE = 240  # frames, 4 s: validation streams through pieces of clip
 
 
 class Training:
-    """The interface of trainings, which train the weights of a run.
-
-    Attributes:
-        kind: the kind of the run (see `Identity`).
-    """
+    """The interface of trainings, which train the weights of a run of this `kind` (see `Identity`)."""
 
     kind: str
 
@@ -52,29 +48,17 @@ class Training:
         device: torch.device,
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train, from the run's checkpoint if there is one, and write the weights.
-
-        Args:
-            architecture: builds the network.
-            data: the prepared motion.
-            prerequisite: weights file of the prerequisite run, such as a frozen VQ-VAE; None without one.
-            run: the run; its folder receives checkpoints, log and weights.
-            device: the device to train on.
-            on_validation: called after each validation; see `memmlp.training.loop.train`.
-
-        Returns:
-            The validation errors of the kept weights; empty in a process that does not validate.
-        """
+        """Train, from the run's checkpoint if there is one, and write the weights to the run's folder.
+        `prerequisite` is the weights file of the prerequisite run, such as a frozen VQ-VAE. Return the
+        validation errors of the kept weights; empty in a process that does not validate."""
         raise NotImplementedError
 
 
 def make_validation(
     data: PreparedMotion, metrics: UserMetrics, device: torch.device, count: int | None = None
 ) -> Callable[[MotionModel], dict[str, float]]:
-    """Return a function that measures a network on the validation clips; {} without validation clips.
-
-    It measures `count` pieces of the clips, evenly spread, or all of them.
-    """
+    """Return a function that measures a network on `count` evenly spread pieces of the validation clips, or
+    all of them; {} without validation clips."""
     if not data.has("val"):
         return lambda network: {}
     pieces = modes.cut_clips(data.open("val").to(device), VALIDATION_PIECE, least=60)
@@ -90,18 +74,9 @@ def read_kept_errors(run: Run) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class NetworkTraining(Training):
-    """The training of a motion network.
-
-    Attributes:
-        seed: seed of the weights, batches and rollouts.
-        loss: makes the loss, given the network's branches.
-        rollout: makes the history that the network is trained on.
-        optim: steps, learning rates and intervals.
-        drawn_by: the sampling of training windows, "frames" or "clips" (see WindowSampler).
-        shares: the fraction of windows drawn from each source (see WindowSampler).
-        metrics: custom metrics, measured at validations.
-        mirror: whether half of the training windows are mirrored (see MirroredDataset).
-    """
+    """The training of a motion network. `loss` makes the loss, given the network's branches. `drawn_by` and
+    `shares` are those of WindowSampler. Custom `metrics` are measured at validations. With `mirror`, half of
+    the training windows are mirrored."""
 
     seed: int
     loss: Callable[[frozenset[str]], Loss]
@@ -135,10 +110,8 @@ class NetworkTraining(Training):
         prerequisite: Path | None,
         device: torch.device,
     ) -> MotionTask:
-        """Make the task of training a new network; see `train` for the arguments.
-
-        It seeds torch for the initial weights, and restarts the rollout.
-        """
+        """Make the task of training a new network; see `train` for the arguments. It seeds torch for the
+        initial weights, and restarts the rollout."""
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
         normalizer = architecture.make_normalizer(data.manifest, dataset.frames)
@@ -211,16 +184,9 @@ class MotionTask(TrainingTask):
 
 @dataclass(frozen=True)
 class VQVAETraining(Training):
-    """The training of a VQ-VAE.
-
-    Every epoch uses each training frame once (docs/readings.md, no. 5). `data.drawn_by` and the sources'
-    weights have no effect here, so networks with different window sampling can share a VQ-VAE.
-
-    Attributes:
-        seed: seed of the weights and batches.
-        optim: makes the optimisation, given the number of training frames.
-        mirror: whether half of the training frames are mirrored (see MirroredDataset).
-    """
+    """The training of a VQ-VAE. Every epoch uses each training frame once (docs/readings.md, no. 5).
+    `data.drawn_by` and the sources' weights have no effect here, so networks with different window sampling
+    can share a VQ-VAE. `optim` makes the optimisation, given the number of training frames."""
 
     seed: int
     optim: Callable[[int], Optim]

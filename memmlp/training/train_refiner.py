@@ -32,12 +32,10 @@ STREAMS_TOGETHER = 64  # pieces that the network streams through side by side
 
 
 class SAGERefinerLoss(Loss):
-    """The loss of SAGE-Net's refiner (CVPR 2024, released code), dominated by rotation velocities.
-
-    Errors of 6D rotations, and of rotation changes over one and three frames, are smooth L1 over all
-    components. Positions come from forward kinematics with the pelvis at the origin. For head and hands, the
-    head is on its tracker instead.
-    """
+    """The loss of SAGE-Net's refiner (CVPR 2024, released code), dominated by rotation velocities. Errors of
+    6D rotations, and of rotation changes over one and three frames, are smooth L1 over all components.
+    Positions come from forward kinematics with the pelvis at the origin, for head and hands with the head on
+    its tracker."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -81,17 +79,8 @@ LOSSES: dict[str, Callable[[], Loss]] = {
 
 @dataclass(frozen=True)
 class RefinerTraining(Training):
-    """The training of a refiner.
-
-    Attributes:
-        seed: seed of the weights, pieces and batches.
-        refiner: the refiner's settings, such as the number and length of pieces.
-        optim: steps, learning rates and intervals; a batch consists of pieces.
-        drawn_by: the sampling of pieces, "frames" or "clips" (see WindowSampler).
-        shares: the fraction of pieces drawn from each source (see WindowSampler).
-        mirror: whether half of the pieces are mirrored (see MirroredDataset).
-        metrics: custom metrics, measured at validations.
-    """
+    """The training of a refiner on batches of pieces, of which half are mirrored with `mirror`. `drawn_by`
+    and `shares` are those of WindowSampler. Custom `metrics` are measured at validations."""
 
     seed: int
     refiner: SAGERefinerSettings

@@ -3,8 +3,7 @@
 The parts are a VQ-VAE for each half of the body, a diffusion model for the latents of each half, and a
 decoder. The lower diffusion model also sees the upper latents that the upper model predicts. The decoder sees
 the predictions of both models. Each part has its own run, and its file holds all parts trained so far.
-Trained parts stay frozen.
-"""
+Trained parts stay frozen."""
 
 from __future__ import annotations
 
@@ -47,12 +46,8 @@ CODE_WEIGHTS = {"orientation": 0.2, "rotation": 1.0, "position": 5.0, "hand": 5.
 
 @dataclass(frozen=True)
 class DroppingOptim(Optim):
-    """AdamW with a learning rate that falls at some steps.
-
-    Attributes:
-        lr_drops_at: fractions of the steps at which the learning rate falls.
-        lr_drop: factor on the learning rate at each of these steps.
-    """
+    """AdamW whose learning rate is multiplied by `lr_drop` at these fractions of the steps
+    (`lr_drops_at`)."""
 
     lr_drops_at: Sequence[float] = ()
     lr_drop: float = 1.0
@@ -136,12 +131,8 @@ class SAGEPrerequisiteSettings(Settings):
             )
 
     def trainings(self, config: Mapping[str, Any], network: NetworkTraining) -> Iterator[SAGEPartTraining]:
-        """Yield the training of each part, in order.
-
-        Args:
-            config: the resolved config of the whole network.
-            network: the training of the whole network; its parts use the same window sampling.
-        """
+        """Yield the training of each part, in order. The parts use the same window sampling as the whole
+        `network`."""
         same = ("checkpoint_every", "log_every", "precision")
         often = {name: getattr(network.optim, name) for name in same}
         for kind in PARTS:
@@ -154,12 +145,7 @@ class SAGEPrerequisiteSettings(Settings):
 
 @dataclass(frozen=True)
 class SAGEPartTraining(Training):
-    """The training of one of SAGE-Net's parts, in its own run.
-
-    Attributes:
-        kind: the part, one of PARTS.
-        network: seed, optimisation and window sampling.
-    """
+    """The training of the part `kind`, one of PARTS, in its own run."""
 
     kind: str
     network: NetworkTraining
@@ -252,10 +238,8 @@ class SAGEPartTask(TrainingTask):
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Compute the losses on the validation windows, with all joints visible and with sampled latents.
-
-        The result is empty without validation windows.
-        """
+        """Compute the losses on the validation windows, with all joints visible and with sampled latents;
+        empty without validation windows."""
         if self.validation is None:
             return {}
         return {name: float(term) for name, term in self.objective(self.validation, False).items()}
@@ -266,12 +250,8 @@ Objective = Callable[[Tensor, bool], dict[str, Tensor]]
 
 
 def make_objective(kind: str, halves: nn.ModuleDict) -> Objective:
-    """Return the objective that trains a part.
-
-    Args:
-        kind: one of PARTS, except "decoder".
-        halves: the network ("net"), and the VQ-VAE of each half ("upper", "lower").
-    """
+    """Return the objective that trains a part except "decoder"; `halves` has the network ("net"), and the
+    VQ-VAE of each half ("upper", "lower")."""
     half, part = kind.split("_")
     net, codes = halves["net"], halves[half]
     assert isinstance(net, SAGENet)
@@ -282,17 +262,10 @@ def make_objective(kind: str, halves: nn.ModuleDict) -> Objective:
 
 
 def compute_code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return a VQ-VAE's losses: rotations and joint positions of the last frame, and the codebooks' loss.
-
-    In training, random joints of the half are hidden, except the first joint, so that the VQ-VAE learns to
-    guess them. The upper half also has a loss for the hands' positions.
-
-    Args:
-        net: the network; the VQ-VAE works in its network space.
-        codes: the VQ-VAE.
-        frames: world windows (B, T, 252).
-        training: whether joints are hidden.
-    """
+    """Return a VQ-VAE's losses for world windows (B, T, 252): rotations and joint positions of the last frame
+    in network space, and the codebooks' loss. In training, random joints of the half are hidden, except the
+    first joint, so that the VQ-VAE learns to guess them. The upper half also has a loss for the hands'
+    positions."""
     rotation, encoded = encode_windows(net, frames)
     sixd = rotation.unflatten(-1, (N_JOINTS, 6))
     hidden = distributed.draw_rows(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_FRACTION
@@ -307,17 +280,9 @@ def compute_code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training
 def measure_half_errors(
     net: SAGENet, joints: tuple[int, ...], predicted: Tensor, frame: Tensor, truth: Tensor
 ) -> dict[str, Tensor]:
-    """Return smooth L1 errors of a half's rotations, and of its joint positions by forward kinematics.
-
-    A half contains all ancestors of its joints, so the other joints' rotations do not matter.
-
-    Args:
-        net: the network; the rotations are in its network space.
-        joints: the half's joints.
-        predicted: the half's predicted rotations (B, J, 6).
-        frame: world frames (B, 252).
-        truth: the true rotations (B, 22, 6) of all joints.
-    """
+    """Return smooth L1 errors of a half's predicted rotations (B, J, 6), network space, and of its joint
+    positions by forward kinematics, for world frames (B, 252) and the true rotations (B, 22, 6). A half
+    contains all ancestors of its joints, so the other joints' rotations do not matter."""
     sparse, own = frame[:, None, :SPARSE_DIM], list(joints)
     full = truth.clone()
     full[:, own] = predicted.to(truth)
@@ -340,11 +305,8 @@ def measure_half_errors(
 def compute_latent_losses(
     net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool, lower: bool
 ) -> dict[str, Tensor]:
-    """Return the smooth L1 error of a half's latents; see `compute_code_losses` for the other arguments.
-
-    Args:
-        lower: whether this is the lower half; it also sees sampled latents of the upper half.
-    """
+    """Return the smooth L1 error of a half's latents (see `compute_code_losses`). The `lower` half also sees
+    sampled latents of the upper half."""
     rotation, encoded = encode_windows(net, frames)
     clean = encode_latents(codes, rotation, encoded)
     with torch.no_grad():
@@ -365,10 +327,8 @@ def encode_windows(net: SAGENet, frames: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def encode_latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tensor:
-    """Return a trained VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54).
-
-    The latents are always computed in float32, because rounding would select other code-vectors.
-    """
+    """Return a trained VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54),
+    always in float32, because rounding would select other code-vectors."""
     assert not codes.training
     with use_float32(rotation.device):
         return codes.encode(rotation, encoded)[0]

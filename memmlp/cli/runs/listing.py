@@ -113,7 +113,6 @@ def _read_records(runs: Sequence[Run], most: int) -> dict[str, Record]:
 
 
 def _describe_outdated_results(listed: Sequence[Run]) -> list[str]:
-    """Return a line for each mode with results of an earlier component version."""
     ids_by_change: dict[tuple[str, str], list[str]] = {}
     for run in listed:
         for results in list_outdated_results(run).items():
@@ -180,13 +179,8 @@ def _choose_keys(columns: str | None, records: Mapping[str, Record], listed: Seq
 
 
 def _print_table(records: Sequence[Record], keys: Sequence[str], keys_requested: bool) -> list[str]:
-    """Print the runs as a table, and return the keys that did not fit.
-
-    Args:
-        records: the record of each run, with its `age`.
-        keys: the keys to show.
-        keys_requested: whether --columns requested the keys. Then all keys are shown, without results.
-    """
+    """Print the runs, by their records with `age`, as a table, and return the keys that did not fit. Keys
+    that --columns requested are all shown, without results."""
     columns = _make_columns(records, keys, keys_requested)
     removable = ["age"] if keys_requested else [*REMOVABLE_COLUMNS, *reversed(keys[:MAX_COLUMNS])]
     wide = make_console(width=10_000)

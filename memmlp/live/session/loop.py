@@ -1,8 +1,7 @@
 """The loop of `memmlp live`: it reads samples, runs the stream, and sends poses to outputs and pages.
 
 Between samples, it executes commands from the page, which adjust the stream to the user. Commands arrive in
-the server's threads. A calibration starts after a countdown, so the user can leave the keyboard.
-"""
+the server's threads. A calibration starts after a countdown, so the user can leave the keyboard."""
 
 from __future__ import annotations
 
@@ -45,15 +44,8 @@ def make_greeting(
     remark: str = "",
     avatar: bool = False,
 ) -> dict[str, Any]:
-    """Return the first message to a page.
-
-    Args:
-        source: the source of samples.
-        network: the network's name.
-        outputs: the other receivers of poses.
-        remark: a warning about the network, such as too little training.
-        avatar: whether the page shows an avatar. If True, the message contains its bones.
-    """
+    """Return the first message to a page. `outputs` are the other receivers of poses; `remark` is a warning
+    about the network. If the page shows an avatar, the message contains its bones."""
     return {
         "network": network,
         "remark": remark,
@@ -79,18 +71,10 @@ def run_loop(
     avatar: bool = False,
     report: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Run the stream on samples, and send the frames to outputs and open pages, until `stopped` is set.
-
-    Args:
-        stream: the stream.
-        source: the source of samples.
-        publish: gets the messages (`make_frame_message`). For a malformed sample, it gets only the counts.
-        stopped: ends the loop.
-        outputs: the outputs; they get each frame before the pages.
-        fitting: executes the page's commands between samples.
-        avatar: whether messages include the avatar's pose (`make_avatar_message`).
-        report: gets a line about odd samples (`OddSamples`) and about the first malformed sample.
-    """
+    """Run the stream on samples, and send the frames to outputs, then to open pages, until `stopped` is set.
+    `publish` gets the messages (`make_frame_message`, `make_avatar_message` with `avatar`), for a malformed
+    sample only the counts. `fitting` executes the page's commands between samples. `report` gets a line about
+    odd samples (`OddSamples`) and about the first malformed sample."""
     stream.odd = OddSamples(report)
     number, counts = 0, {"dropped": 0, "malformed": 0}
     while not stopped.is_set():
@@ -165,12 +149,8 @@ def make_avatar_message(frame: BodyFrame) -> dict[str, Any]:
 
 
 class PageCommand(NamedTuple):
-    """A command from the page.
-
-    Attributes:
-        action: one of ACTIONS.
-        value: metres for height and floor; the countdown in seconds for calibrate and touch_floor.
-    """
+    """A command from the page, one of ACTIONS. Its value is metres for height and floor, and the countdown in
+    seconds for calibrate and touch_floor."""
 
     action: str
     value: float | None
@@ -189,14 +169,8 @@ def parse_page_command(fields: object) -> PageCommand:
 
 class Fitting:
     """Executes commands that adjust a stream to its user: body height, floor, and calibration in a T-pose.
-
-    Args:
-        stream: the stream.
-        space: the stream's frame of reference.
-        path: the calibration file, updated after each change; None for no file.
-        publish_state: gets "wearer" and the new state after each change.
-        clock: returns the time, seconds.
-    """
+    After each change, the calibration file `path` (if any) is updated, and `publish_state` gets "wearer" and
+    the new state. `clock` returns seconds."""
 
     def __init__(
         self,
@@ -219,11 +193,8 @@ class Fitting:
         self.commands.put(parse_page_command(fields))
 
     def step(self, trackers: QuaternionPoses | None) -> None:
-        """Execute new commands, and the waiting command after its countdown.
-
-        Args:
-            trackers: the current poses of the devices; None without a sample.
-        """
+        """Execute new commands, and the waiting command after its countdown, for the current poses of the
+        devices, None without a sample."""
         while not self.commands.empty():
             command = self.commands.get()
             if command.action in ("calibrate", "touch_floor"):

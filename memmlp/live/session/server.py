@@ -1,7 +1,5 @@
-"""The server of the live page. It sends files and frames (server-sent events), and receives commands.
-
-Pages may be opened and closed at any time. A slow page misses frames, but does not delay other pages.
-"""
+"""The server of the live page. It sends files and frames (server-sent events), and receives commands. Pages
+may be opened and closed at any time. A slow page misses frames, but does not delay other pages."""
 
 from __future__ import annotations
 
@@ -38,15 +36,9 @@ EXTENSIONS = ("VRMC_vrm", "VRM")  # of VRM 1.0, and 0.x
 
 
 def load_page_files(vrm: bytes | None = None) -> dict[str, bytes]:
-    """Return the files of the page by name.
-
-    Args:
-        vrm: a VRM avatar. If given, the files include the avatar and three-vrm, and three.js comes from its
-        npm package, which also contains the loader.
-
-    Raises:
-        InputError: if an npm package cannot be downloaded.
-    """
+    """Return the files of the page by name. With a VRM avatar, they include the avatar and three-vrm, and
+    three.js from its npm package, which contains the loader. Raises InputError if a package cannot be
+    downloaded."""
     files = {name: read_page_file("memmlp.live.session", name) for name in PAGE}
     files |= {name: read_page_file("memmlp.common", name) for name in COMMON}
     if vrm is None:
@@ -84,11 +76,7 @@ def read_vrm(path: Path) -> bytes:
 
 
 class Hub:
-    """Sends states and frames to all open pages.
-
-    Args:
-        greeting: the first state for each page.
-    """
+    """Sends states and frames to all open pages; `greeting` is the first state for each page."""
 
     def __init__(self, greeting: Mapping[str, Any]):
         self.changed = threading.Condition()
@@ -167,14 +155,8 @@ class LiveHandler(PageHandler):
 
 
 class LiveServer(PageServer):
-    """Serves the live page.
-
-    Args:
-        hub: sends the frames to the pages.
-        port, host, token: see `PageServer`.
-        files: the page's files by name.
-        take_command: processes a command from the page, or raises InputError; None to reject all commands.
-    """
+    """Serves the live page with files by name (see `PageServer`). `hub` sends the frames. `take_command`
+    processes a command from the page, or raises InputError; None rejects all commands."""
 
     def __init__(
         self,

@@ -60,13 +60,8 @@ QuaternionPoses = tuple[QuaternionPose, QuaternionPose, QuaternionPose]
 
 
 class Packet(NamedTuple):
-    """One sample of the trackers.
-
-    Attributes:
-        trackers: head, left and right.
-        time: seconds of the sender's clock; None if the packet does not have a time.
-        seq: the sample's number; None if the packet does not have one.
-    """
+    """One sample of head, left and right; `time` is seconds of the sender's clock; `seq` is the sample's
+    number; both may be None."""
 
     trackers: QuaternionPoses
     time: float | None = None
@@ -107,10 +102,8 @@ def _read_arguments(message: Any) -> list[Any] | None:
 
 
 def read_packet(fields: Mapping[str, Any]) -> Packet:
-    """Make a packet from its fields. Raises InputError if a field is malformed.
-
-    The stream checks later whether times and rotations are valid.
-    """
+    """Make a packet from its fields. Raises InputError if a field is malformed. The stream checks later
+    whether times and rotations are valid."""
     if not any(name in fields for name in TRACKERS):
         raise InputError(f"packet: must have at least one of {', '.join(TRACKERS)}")
     seq = fields.get("seq")
@@ -133,14 +126,8 @@ def _read_pose(name: str, values: Any) -> QuaternionPose:
 
 
 class SourceSample(NamedTuple):
-    """A sample from a source.
-
-    Attributes:
-        time: seconds of the trackers' clock.
-        trackers: head, left and right.
-        arrived: the arrival time, seconds of `time.perf_counter`.
-        dropped: number of lost samples before this sample.
-    """
+    """A sample of head, left and right: seconds of the trackers' clock, arrival time (seconds of
+    `time.perf_counter`), and the number of lost samples before this one."""
 
     time: float
     trackers: QuaternionPoses
@@ -149,23 +136,16 @@ class SourceSample(NamedTuple):
 
 
 class TrackerSource(Protocol):
-    """A source of tracker samples.
-
-    Attributes:
-        name: the description of the source.
-        space: the frame of reference of the poses.
-        has_wearer: whether a user wears the trackers. If True, the stream can be adjusted to the user.
-    """
+    """A source of tracker samples in a frame of reference; `name` describes it. If `has_wearer`, a user wears
+    the trackers, and the stream can be adjusted to the user."""
 
     name: str
     space: SpaceName
     has_wearer: bool
 
     def read(self) -> SourceSample | None:
-        """Return the next sample; None if no sample arrives within `WAIT` seconds.
-
-        Raises InputError for a malformed sample.
-        """
+        """Return the next sample; None if no sample arrives within `WAIT` seconds. Raises InputError for a
+        malformed sample."""
 
     def get_true_joints(self, time: float) -> np.ndarray | None:
         """Return the true joints (22, 3), metres, AMASS' world, at a time; None if unknown."""
@@ -175,12 +155,8 @@ class TrackerSource(Protocol):
 
 
 class TrackedClip:
-    """A clip with interpolated tracker poses and true joints.
-
-    Args:
-        name: the clip's name.
-        frames: [X | Theta] (N, 252) at 60 Hz, world (`memmlp.motion.body`).
-    """
+    """A clip with interpolated tracker poses and true joints, from frames [X | Theta] (N, 252) at 60 Hz,
+    world."""
 
     def __init__(self, name: str, frames: np.ndarray):
         self.name = name
@@ -214,15 +190,9 @@ class TrackedClip:
 
 
 def read_npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
-    """Read an AMASS npz, and return its frames (N, 252) at 60 Hz on a network's body.
-
-    Args:
-        path: the file.
-        rest: rest joints of the body (22, 3), metres, SMPL's body frame.
-
-    Raises:
-        InputError: if the clip has fewer than 3 frames at 60 Hz, or was imported onto another body.
-    """
+    """Read an AMASS npz, and return its frames (N, 252) at 60 Hz on a body with rest joints (22, 3), metres,
+    SMPL's body frame. Raises InputError if the clip has fewer than 3 frames at 60 Hz, or was imported onto
+    another body."""
     import torch
 
     from memmlp.motion.body import check_imported_body
@@ -243,16 +213,8 @@ def read_npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
 
 
 class ClipSource:
-    """Plays a clip in real time at a fixed rate, like a headset. The clip repeats endlessly.
-
-    A sample is dropped if the processing of the previous sample takes too long.
-
-    Args:
-        clip: the clip.
-        hz: number of samples per second.
-        clock: returns the time, seconds; by default, the machine's clock.
-        sleep: waits for a number of seconds; by default, `time.sleep`.
-    """
+    """Plays a clip in real time at a fixed rate, like a headset, and repeats it endlessly. A sample is
+    dropped if the processing of the previous sample takes too long."""
 
     space: SpaceName = "amass"
     has_wearer = False
@@ -299,19 +261,10 @@ class ClipSource:
 
 
 class PacketSource:
-    """Receives packets at a UDP port, from this machine and from listed other machines.
-
-    Args:
-        name: the kind of packets, for messages.
-        port: the port; 0 for any free port.
-        parse: parses a datagram, or raises InputError.
-        space: the frame of reference of the poses.
-        senders: other machines that may send packets. If empty, only this machine can reach the port.
-        report: gets a line about each machine with rejected packets.
-
-    Raises:
-        InputError: if the port is in use.
-    """
+    """Receives packets at a UDP port (0 for any free one), from this machine and from the machines in
+    `senders`; without these, only this machine can reach the port. `name` is the kind of packets. `parse`
+    parses a datagram, or raises InputError. `report` gets a line about each machine with rejected packets.
+    Raises InputError if the port is in use."""
 
     has_wearer = True
 
@@ -342,10 +295,8 @@ class PacketSource:
         self.last: int | None = None
 
     def read(self) -> SourceSample | None:
-        """Return the sample of the next packet; None if no packet arrives in time, or if it is dropped.
-
-        A late packet is dropped. It was already counted as lost. Raises InputError for a malformed packet.
-        """
+        """Return the sample of the next packet; None if no packet arrives in time, or if it is late and
+        dropped; it was already counted as lost. Raises InputError for a malformed packet."""
         try:
             datagram, (sender, _) = self.socket.recvfrom(LARGEST)
         except TimeoutError:

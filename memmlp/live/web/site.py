@@ -60,16 +60,9 @@ Entry = dict[str, Any]
 
 @dataclass(frozen=True)
 class SiteNetwork:
-    """A network on a site.
-
-    Attributes:
-        key: the network's name in file names and the page's code.
-        name: the network's display name.
-        run: the id of the network's run.
-        model: the trained network.
-        clips: names of its test clips on the site.
-        remark: a warning on the page, such as too little training; empty for no warning.
-    """
+    """A network on a site: `key` is its name in file names and the page's code, `name` its display name,
+    `run` its run's id. `clips` are its test clips on the site. `remark` is a warning on the page; empty for
+    none."""
 
     key: str
     name: str
@@ -80,13 +73,8 @@ class SiteNetwork:
 
 
 class SiteClip(NamedTuple):
-    """A clip on a site.
-
-    Attributes:
-        key: the clip's name in file names: a digest of the content.
-        name: the clip's display name.
-        content: little-endian float32 (frames, 87).
-    """
+    """A clip on a site: `key`, a digest of the content, in file names, the display name, and little-endian
+    float32 (frames, 87)."""
 
     key: str
     name: str
@@ -99,13 +87,8 @@ class SiteClip(NamedTuple):
 
 
 def pack_clip(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
-    """Return the middle part of a clip.
-
-    Args:
-        name: the clip's name.
-        frames: [X | Theta] (N, 252) at 60 Hz, world (`memmlp.motion.body`).
-        seconds: maximum duration of the part, seconds.
-    """
+    """Return the middle part of a clip, at most `seconds` long, from frames [X | Theta] (N, 252) at 60 Hz,
+    world."""
     count = min(len(frames), round(seconds * FPS))
     first = (len(frames) - count) // 2
     clip = TrackedClip(name, frames[first : first + count])
@@ -121,24 +104,14 @@ def pack_clip(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
 
 @dataclass(frozen=True)
 class Site:
-    """The contents of a site.
-
-    Attributes:
-        networks: the networks, which play clips and run on headsets.
-        clips: the clips to play.
-    """
+    """The contents of a site: networks, which play clips and run on headsets, and the clips to play."""
 
     networks: Sequence[SiteNetwork]
     clips: Sequence[SiteClip]
 
     def write(self, out: Path) -> int:
-        """Write the site atomically, and return its size in bytes.
-
-        An earlier site in the folder is replaced.
-
-        Raises:
-            InputError: if the folder has other content, or ONNX Runtime cannot be downloaded.
-        """
+        """Write the site atomically in place of an earlier one, and return its size in bytes. Raises
+        InputError if the folder has other content, or ONNX Runtime cannot be downloaded."""
         check_site_folder(out)
         unfinished = temporary_path(out)
         try:
@@ -229,10 +202,8 @@ def _write_file(folder: Path, address: str, content: bytes) -> str:
 
 
 def _write_page(folder: Path) -> None:
-    """Write the page's files with its security policy, and a service worker that lists all files.
-
-    The version of the worker changes if any file changes.
-    """
+    """Write the page's files with its security policy, and a service worker that lists all files and whose
+    version changes with them."""
     page = resources.files("memmlp.live.web").joinpath("page")
     for package, names in {"memmlp.live.web": [path.name for path in page.iterdir()], **OTHER_PAGES}.items():
         for name in names:

@@ -29,14 +29,9 @@ ROTATIONS, POSITIONS = ("rx", "ry", "rz"), ("tx", "ty", "tz")
 
 @dataclass(frozen=True)
 class Bone:
-    """A bone of an ASF file.
-
-    Attributes:
-        vector: vector from the bone's start to its end in the zero pose (3,), metres.
-        axes: the rotation C of the bone's axes.
-        dofs: the bone's values in a frame, in the file's order: some of `rx`, `ry`, `rz`, and for the root
-            also `tx`, `ty`, `tz`.
-    """
+    """A bone of an ASF file: its vector (3,) from start to end in the zero pose, metres, the rotation C of
+    its axes, and its values in a frame, in the file's order: some of `rx`, `ry`, `rz`, and for the root also
+    `tx`, `ty`, `tz`."""
 
     vector: np.ndarray
     axes: Rotation
@@ -45,12 +40,8 @@ class Bone:
 
 @dataclass(frozen=True)
 class AsfAmc(Recording):
-    """A take in ASF/AMC format, in metres. Its nodes are the root, the bones, and the end sites.
-
-    Attributes:
-        bones: the root and the bones, in the order of the nodes, without end sites.
-        unit: the file's length unit, metres.
-        first_frame: number of the first frame, which is above 1 in cut takes.
+    """A take in ASF/AMC format, in metres. Its nodes are the root and the bones, which `bones` has in this
+    order, and the end sites. `unit` is the file's length unit, metres. `first_frame` is above 1 in cut takes.
     """
 
     bones: tuple[Bone, ...]
@@ -58,10 +49,8 @@ class AsfAmc(Recording):
     first_frame: int
 
     def compute_kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3), metres, of all frames.
-
-        An end site has the rotation of its bone.
-        """
+        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3), metres, of all frames. An
+        end site has the rotation of its bone."""
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.zeros((len(self.nodes), len(self), 3))
         first = 0
@@ -104,12 +93,9 @@ class AsfAmc(Recording):
 
 
 def read_amc(path: Path) -> AsfAmc:
-    """Read a take and its skeleton, which is in the same folder (`05.asf` for `05_01.amc`).
-
-    Raises:
-        InputError: if the skeleton is missing or one of the files is damaged, such as by invalid numbers,
-            missing bones, or a gap between frames. The message has the file and if possible the line.
-    """
+    """Read a take and its skeleton, which is in the same folder (`05.asf` for `05_01.amc`). Raises InputError
+    if the skeleton is missing or one of the files is damaged, such as by invalid numbers, missing bones, or a
+    gap between frames. The message has the file and if possible the line."""
     names, parents, bones, unit = _read_asf(find_asf(path))
     ends = [node for node in range(len(names)) if node not in parents]
     offsets = [np.zeros(3), *(bones[parent].vector for parent in [*parents[1:], *ends])]
@@ -129,11 +115,8 @@ def read_amc(path: Path) -> AsfAmc:
 
 
 def find_asf(path: Path) -> Path:
-    """Find the skeleton of a take: an ASF file in the same folder, such as `05.asf` for `05_01.amc`.
-
-    Raises:
-        InputError: if there is no skeleton.
-    """
+    """Find the skeleton of a take: an ASF file in the same folder, such as `05.asf` for `05_01.amc`. Raises
+    InputError if there is none."""
     files = [file for file in path.parent.glob("*") if file.suffix.lower() == ".asf"]
     matches = [file for file in files if path.stem.lower().startswith(f"{file.stem}_".lower())]
     if not matches:
@@ -280,7 +263,6 @@ def _parse_dofs(path: Path, line: int, words: Sequence[str], choices: Sequence[s
 def _read_hierarchy(
     path: Path, rows: Sequence[tuple[int, list[str]]], bones: Mapping[str, Bone]
 ) -> tuple[list[str], list[int]]:
-    """Read node names and their parents' indices. Each node comes after its parent."""
     names, parents = [ROOT], [-1]
     for line, (parent, *children) in rows:
         if parent.lower() in ("begin", "end") and not children:

@@ -45,19 +45,14 @@ TIPS = {
 
 @dataclass(frozen=True)
 class Bvh(Recording):
-    """A BVH file. Its nodes are the joints, followed by the end sites.
-
-    Attributes:
-        channels: each joint's channels (see `CHANNELS`) in the file's order, without end sites.
-    """
+    """A BVH file. Its nodes are the joints, followed by the end sites. `channels` are each joint's, without
+    end sites, in the file's order."""
 
     channels: tuple[tuple[str, ...], ...]
 
     def compute_kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3) of all frames.
-
-        An end site has the rotation of its joint.
-        """
+        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3) of all frames. An end site
+        has the rotation of its joint."""
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.empty((len(self.nodes), len(self), 3))
         first = 0
@@ -112,13 +107,9 @@ def _rotate(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
 
 
 def read_bvh(path: Path) -> Bvh:
-    """Read a BVH file. Line ends, blanks and the letter case of keywords may vary.
-
-    Raises:
-        InputError: if the file is damaged (braces, numbers, counts, names, channels, frame time, encoding),
-            has more than 1000 joints, or is larger than 256 MiB. The message has the file and if possible the
-            line.
-    """
+    """Read a BVH file. Line ends, blanks and the letter case of keywords may vary. Raises InputError if the
+    file is damaged (braces, numbers, counts, names, channels, frame time, encoding), has more than 1000
+    joints, or is larger than 256 MiB. The message has the file and if possible the line."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: too large; must be at most {MAX_BYTES >> 20} MiB")
@@ -257,11 +248,8 @@ def _read_motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tu
 
 
 def _parse_rate(frame_time: str) -> float:
-    """Convert a frame time to a rate, Hz.
-
-    If the rate is nearly a whole number, it is rounded. A frame time with few digits gives the matching usual
-    rate: both 0.0167 (rounded) and 0.0166 (cut off) are 60 Hz.
-    """
+    """Convert a frame time to a rate, Hz. If the rate is nearly a whole number, it is rounded. A frame time
+    with few digits gives the matching usual rate: both 0.0167 (rounded) and 0.0166 (cut off) are 60 Hz."""
     seconds = _parse_number(frame_time)
     if abs(1 / seconds - round(1 / seconds)) <= RATE_DIGITS / seconds:
         return float(round(1 / seconds))
@@ -309,21 +297,17 @@ def _quote(word: str) -> str:
 
 
 def write_bvh(path: Path, clip: Clip, rest: np.ndarray) -> None:
-    """Write a clip on a body with rest joints `rest` (22, 3), metres, atomically.
-
-    `memmlp data import` recognises the joints as skeleton `smpl_words`. The skeleton `memmlp` also has unit
-    and axes, for clips without a standing person.
-    """
+    """Write a clip on a body with rest joints `rest` (22, 3), metres, atomically. `memmlp data import`
+    recognises the joints as skeleton `smpl_words`. The skeleton `memmlp` also has unit and axes, for clips
+    without a standing person."""
     with atomic_file(path) as file:
         for line in ("HIERARCHY", *_format_joint(0, rest, ""), *_format_motion(clip, rest)):
             file.write(f"{line}\n".encode())
 
 
 def _format_joint(joint: int, rest: np.ndarray, indent: str) -> Iterator[str]:
-    """Yield the lines of a joint and of all joints below it.
-
-    The root's offset is zero, because only some programs add it to the position channels.
-    """
+    """Yield the lines of a joint and of all joints below it. The root's offset is zero, because only some
+    programs add it to the position channels."""
     offset = rest[joint] - rest[max(PARENTS[joint], 0)]
     position = "" if joint else "Xposition Yposition Zposition "
     yield f"{indent}{'JOINT' if joint else 'ROOT'} {JOINTS[joint]}"
@@ -365,16 +349,9 @@ def _format_motion(clip: Clip, rest: np.ndarray) -> Iterator[str]:
 
 
 def compute_euler_zxy(rotations: np.ndarray, previous_angles: np.ndarray | None = None) -> np.ndarray:
-    """Return angles (N, ..., 3), degrees, with Rz Rx Ry = rotations (N, ..., 3, 3).
-
-    A rotation has two triples of angles, apart from full turns. Each frame gets the triple that is nearest to
-    the previous frame, so that programs can interpolate between frames. The result is also valid in gimbal
-    lock.
-
-    Args:
-        rotations: rotation matrices.
-        previous_angles: angles (..., 3) of the frame before the first frame, degrees, if there is one.
-    """
+    """Return angles (N, ..., 3), degrees, with Rz Rx Ry = rotations (N, ..., 3, 3), valid also in gimbal
+    lock. A rotation has two triples of angles, apart from full turns. Each frame gets the one nearest to the
+    previous frame (..., 3), so that programs can interpolate between frames."""
     z = np.arctan2(-rotations[..., 0, 1], rotations[..., 1, 1])
     cosine, sine = np.cos(z)[..., None], np.sin(z)[..., None]
     first = cosine * rotations[..., 0, :] + sine * rotations[..., 1, :]  # rows of Rz^T R = Rx Ry

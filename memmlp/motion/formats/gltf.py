@@ -48,14 +48,9 @@ class Buffer:
     accessors: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, array: np.ndarray, kind: str, target: int | None = None, bounds: bool = False) -> int:
-        """Append an array, and return the index of its accessor.
-
-        Args:
-            array: the elements (N, ...), with a type in `COMPONENTS`.
-            kind: type of each element: SCALAR, VEC3, VEC4 or MAT4.
-            target: VERTICES or INDICES, for a mesh.
-            bounds: whether to add the minimum and maximum, which glTF requires for times and positions.
-        """
+        """Append an array (N, ...) with a type in `COMPONENTS`, and return the index of its accessor. `kind`
+        is SCALAR, VEC3, VEC4 or MAT4; `target` is VERTICES or INDICES, for a mesh. glTF requires `bounds`
+        (minimum and maximum) for times and positions."""
         accessor: dict[str, Any] = {
             "bufferView": len(self.views), "componentType": COMPONENTS[array.dtype.str],
             "count": len(array), "type": kind,
@@ -71,14 +66,8 @@ class Buffer:
 
 
 class Mesh(NamedTuple):
-    """A triangle mesh in which each vertex follows one joint.
-
-    Attributes:
-        positions: vertices (V, 3), metres, in the bind pose.
-        normals: unit normals (V, 3).
-        joints: the joint (V,) that each vertex follows.
-        triangles: indices of vertices (T, 3), counter-clockwise when seen from outside.
-    """
+    """A triangle mesh in which each vertex follows one joint (V,): vertices (V, 3), metres, in the bind pose,
+    unit normals (V, 3), and triangles (T, 3), counter-clockwise when seen from outside."""
 
     positions: np.ndarray
     normals: np.ndarray
@@ -87,12 +76,8 @@ class Mesh(NamedTuple):
 
 
 def build_skinned_figure(buffer: Buffer, bind: np.ndarray, parts: Sequence[Mesh]) -> dict[str, Any]:
-    """Build the glTF content for meshes that follow the 22 joints, without materials.
-
-    Args:
-        buffer: the buffer to which the meshes are added.
-        bind: joint positions in the bind pose (22, 3), metres.
-        parts: the meshes. Mesh i has material i.
+    """Build the glTF content for meshes that follow the 22 joints, without materials, and add them to the
+    buffer. `bind` is the joint positions in the bind pose (22, 3), metres. Mesh i of `parts` has material i.
     """
     nodes: list[dict[str, Any]] = []
     for joint, parent in enumerate(PARENTS):
@@ -154,14 +139,8 @@ def _build_animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, 
 
 
 def compute_continuous_quaternions(rotations: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
-    """Convert rotations (N, J, 3, 3) to unit quaternions xyzw (N, J, 4).
-
-    A rotation has two quaternions. Each frame gets the quaternion nearer to the previous frame.
-
-    Args:
-        rotations: rotation matrices.
-        previous: quaternions (J, 4) of the frame before the first frame, if there is one.
-    """
+    """Convert rotations (N, J, 3, 3) to unit quaternions xyzw (N, J, 4). A rotation has two quaternions. Each
+    frame gets the one nearer to the previous frame (J, 4)."""
     quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
     away = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0
     quaternions[1:] *= np.cumprod(np.where(away, -1, 1), axis=0)
@@ -186,13 +165,8 @@ def merge_meshes(parts: Sequence[Mesh]) -> Mesh:
 
 
 def build_capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.ndarray) -> Mesh:
-    """Build the mesh of a round limb that follows a joint: a cone with half spheres at its ends.
-
-    Args:
-        joint: the joint.
-        radii: the limb's radii at its two ends, metres.
-        start, end: the limb's ends (3,), metres, in the bind pose.
-    """
+    """Build the mesh of a round limb that follows a joint: a cone with half spheres at its ends. Radii and
+    ends (3,) are in metres, in the bind pose."""
     along = (end - start) / np.linalg.norm(end - start)
     side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
     side /= np.linalg.norm(side)
@@ -212,13 +186,8 @@ def build_capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end
 
 
 def write_glb(path: Path, content: dict[str, Any], buffer: Buffer) -> None:
-    """Write a .glb file atomically: a header, a JSON chunk, and a binary chunk.
-
-    Args:
-        path: the file.
-        content: the JSON content without the buffer's entries.
-        buffer: the binary data.
-    """
+    """Write a .glb file atomically: a header, a chunk of JSON `content`, to which the buffer's entries are
+    added, and a binary chunk."""
     size = len(buffer.data)
     buffers = {"accessors": buffer.accessors, "bufferViews": buffer.views, "buffers": [{"byteLength": size}]}
     encoded = json.dumps(content | buffers, separators=(",", ":"), allow_nan=False).encode()
@@ -282,14 +251,8 @@ META = {
 
 
 def write_vrm(path: Path, rest: np.ndarray) -> None:
-    """Write a mannequin as a VRM 1.0 avatar (.vrm), atomically. Its licence is CC0.
-
-    It stands in T-pose on the floor and faces +Z.
-
-    Args:
-        path: the file.
-        rest: rest joints of the body (22, 3), metres.
-    """
+    """Write a mannequin as a VRM 1.0 avatar (.vrm), atomically, for a body with rest joints (22, 3), metres.
+    Its licence is CC0. It stands in T-pose on the floor and faces +Z."""
     buffer = Buffer()
     bind = rest - [0, rest[:, 1].min(), 0]
     figure = build_skinned_figure(buffer, bind, [build_mannequin(bind), build_eyes(bind)])

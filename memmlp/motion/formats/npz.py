@@ -63,17 +63,9 @@ class NoMotionError(InputError):
 
 
 def read_clip(path: Path, name: str) -> Clip:
-    """Read a clip of an SMPL body in bounded memory. Pickled data is never loaded.
-
-    Args:
-        path: the file.
-        name: the clip's name.
-
-    Raises:
-        NoMotionError: if the file is a valid npz without rotations.
-        InputError: if the file is damaged, has invalid shapes or values, or is too large; the message names
-            the file. `motion.plausibility` checks whether the clip can be human motion.
-    """
+    """Read a clip of an SMPL body in bounded memory. Pickled data is never loaded. Raises NoMotionError if
+    the file is a valid npz without rotations, and InputError if it is damaged, has invalid shapes or values,
+    or is too large. `motion.plausibility` checks whether the clip can be human motion."""
     with _open_npz(path) as file:
         layout, trans_key, rate_key = _find_keys(file)
         parts = [file.read_columns(key, widths[0], widths) for key, widths in layout.items()]
@@ -188,10 +180,8 @@ class _NpzReader:
             return np.frombuffer(entry.read(), header.dtype).reshape(header.shape)
 
     def read_columns(self, name: str, count: int, widths: Collection[int]) -> np.ndarray:
-        """Read the first `count` columns of an array (N, columns) or (N, J, 3) as float64.
-
-        The number of columns must be in `widths`.
-        """
+        """Read the first `count` columns of an array (N, columns) or (N, J, 3) as float64. The number of
+        columns must be in `widths`."""
         header = self.read_header(name)
         shape = header.shape
         flat = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and not header.fortran)

@@ -46,13 +46,7 @@ class Recording:
         raise NotImplementedError
 
     def compute_pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose.
-
-        Args:
-            turns: node -> its rotation values, like in a frame of the file. The values of all other nodes are
-                zero, and the root is at the origin.
-
-        Raises:
-            InputError: if a node has a wrong number of values.
-        """
+        """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose with the root at the
+        origin, given node -> its rotation values, like in a frame of the file; other nodes' are zero. Raises
+        InputError if a node has a wrong number of values."""
         raise NotImplementedError

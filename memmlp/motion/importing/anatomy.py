@@ -65,11 +65,9 @@ def normalize_vectors(vectors: np.ndarray) -> np.ndarray:
 
 
 def compute_least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Compute the smallest rotations (..., 3, 3) from directions `source` to directions `target` (..., 3).
-
-    A direction of length zero gives the identity. Opposite directions give a half turn about some axis
-    perpendicular to the directions.
-    """
+    """Compute the smallest rotations (..., 3, 3) from directions `source` to directions `target` (..., 3). A
+    direction of length zero gives the identity. Opposite directions give a half turn about some perpendicular
+    axis."""
     axis, along = np.cross(source, target), (source * target).sum(-1, keepdims=True)
     norm = np.linalg.norm(axis, axis=-1, keepdims=True)
     opposite = (norm == 0) & (along < 0)
@@ -86,9 +84,7 @@ def align_directions(
     first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
     """Compute the rotation (3, 3) that aligns one direction exactly, and a second one as far as possible.
-
-    Each argument is a pair of a direction and its target direction.
-    """
+    Each argument is a pair of a direction and its target direction."""
     (a, to_a), (b, to_b) = first, second
     once = compute_least_rotation(a, to_a)
     axis = normalize_vectors(to_a)
@@ -101,10 +97,8 @@ def align_directions(
 
 
 def find_stance_fault(pose: np.ndarray) -> str | None:
-    """Return why a pose (22, 3) is not a stance; None for a stance.
-
-    The facing direction, left and right are not checked.
-    """
+    """Return why a pose (22, 3) is not a stance, regardless of facing direction, left and right; None for a
+    stance."""
     for start, end in ((0, HEAD), *LIMBS.items()):
         if np.linalg.norm(pose[end] - pose[start]) < SHORTEST:
             return f"{JOINTS[start]} and {JOINTS[end]} are at the same place"
@@ -163,7 +157,6 @@ def find_facing_turn(pose: np.ndarray) -> np.ndarray:
 
 
 def _list_vertical_segments() -> Iterator[tuple[int, int, np.ndarray, float]]:
-    """Yield the vertical segments of a stance: start, end, direction, and tolerance in degrees."""
     yield 0, HEAD, UP, TRUNK
     for start, end in LEGS.items():
         yield start, end, -UP, THIGHS if start in HIPS else SHINS
@@ -173,13 +166,11 @@ def _list_vertical_segments() -> Iterator[tuple[int, int, np.ndarray, float]]:
 
 
 def compute_orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Compute the rotations (22, 3, 3) that pose a body like a stance (22, 3) that faces +Z.
-
-    Every segment has its direction in the stance. The twist of the pelvis follows the hips, the twist of the
-    chest follows the shoulders, and the spine is between them. Upper limbs get the smallest rotation from the
-    body's rest pose (22, 3). Lower limbs get the smallest rotation from the upper limbs. The head is upright
-    and faces in the direction of the chest. Wrists and toes have the rotation of their parents.
-    """
+    """Compute the rotations (22, 3, 3) that pose a body with rest joints (22, 3) like a stance (22, 3) that
+    faces +Z. Every segment has its direction in the stance. The twist of the pelvis follows the hips, the
+    twist of the chest follows the shoulders, and the spine is between them. Upper limbs get the smallest
+    rotation from the rest pose, lower limbs from the upper limbs. The head is upright and faces in the
+    direction of the chest. Wrists and toes have the rotation of their parents."""
 
     def is_long(start: int, end: int) -> bool:
         return bool(np.linalg.norm(stance[end] - stance[start]) > SHORTEST)
@@ -212,28 +203,17 @@ def compute_orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarra
 
 
 def find_bend_axis(stance: np.ndarray, joint: int) -> np.ndarray | None:
-    """Find the bending axis (3,) of a knee or elbow in a stance (22, 3); None if the limb is straight.
-
-    Args:
-        stance: the pose.
-        joint: the hip or shoulder above the knee or elbow."""
+    """Find the bending axis (3,) of the knee or elbow below a hip or shoulder in a stance (22, 3); None if
+    the limb is straight."""
     middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
     upper, lower = stance[middle] - stance[joint], stance[end] - stance[middle]
     return normalize_vectors(np.cross(upper, lower)) if compute_angles(upper, lower) > BENT else None
 
 
 def find_hinge_axis(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | None:
-    """Find the bending axis of a knee or elbow from the motion.
-
-    Args:
-        upper: global rotations (N, 3, 3) of the thigh or upper arm.
-        positions: joint positions (N, 22, 3).
-        joint: the hip or shoulder above the knee or elbow, one of `HINGES`.
-
-    Returns:
-        The axis (3,) in the frame of the thigh or upper arm; None if the limb bends too little or about
-        different axes.
-    """
+    """Find the bending axis (3,) of the knee or elbow below a hip or shoulder (one of `HINGES`) from the
+    motion, in the frame of thigh or upper arm, whose global rotations (N, 3, 3) are `upper`; None if the limb
+    bends too little or about different axes."""
     middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
     bones = (
         normalize_vectors(positions[:, middle] - positions[:, joint]),

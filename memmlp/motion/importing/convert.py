@@ -1,20 +1,17 @@
 """Converts a recording to a clip with 22 joints, by a skeleton map.
 
 A body joint has the global rotation of its node in the file, times a constant correction on the right. The
-corrections come from one pose, the stance, in which the person stands upright. For a stance, the rotations of
-the body joints can be computed (`anatomy.compute_orientations`). The file's zero pose is the stance if a
-person stands in it. If not, for example if all bones lie along one axis, the stance is a frame of the motion,
-or a pose in the skeleton map.
+corrections come from one pose, the stance, in which the person stands upright and the rotations of the body
+joints can be computed (`anatomy.compute_orientations`). The stance is the file's zero pose if a person stands
+in it, else a frame of the motion, or a pose in the skeleton map.
 
 The correction is not constant if an unmapped joint between two mapped joints turns. So each segment is also
 turned to its direction in the file, by the smallest rotation. A body joint without a node has its parent's
 rotation.
 
-If a person stands in the zero pose, the head is up in this pose, even if the person lies in the motion. If
-the head is along a different axis in the motion, there are two explanations. The person may lie all the time.
-Or the person walks, and the root's rotation has a different up axis than the zero pose. Then the user has to
-decide.
-"""
+If a person stands in the zero pose, the head is up in this pose. If the head is along a different axis in the
+motion, the person may lie all the time, or the root's rotation has a different up axis than the zero pose.
+Then the user has to decide."""
 
 from __future__ import annotations
 
@@ -74,14 +71,8 @@ JUMPED = 0.05  # multiples of the skeleton's size: smaller first steps are ignor
 
 @dataclass(frozen=True)
 class Conversion:
-    """A recording converted to the body.
-
-    Attributes:
-        clip: the motion, world (Z up). A known floor is at height 0.
-        fitted: the constants of the conversion.
-        fidelity: the deviation between clip and recording, and the clip's likely mistakes.
-        floor: the subtracted height of the floor, metres at the body's scale; None if nothing was subtracted.
-    """
+    """A recording converted to the body. The clip is in the world (Z up), with a known floor at height 0;
+    `floor` is the subtracted height, metres at the body's scale, or None."""
 
     clip: Clip
     fitted: Retargeting
@@ -98,20 +89,9 @@ def convert_recording(
     fps: float,
     floor: str | float = AUTO,
 ) -> Conversion:
-    """Convert a recording to a clip on a body.
-
-    Args:
-        recording: the file's motion.
-        skeleton: the recording's skeleton map.
-        rest: the body's rest joints (22, 3), metres.
-        name: the clip's name.
-        fps: the true frame rate, Hz.
-        floor: `auto`: find the floor from the feet; `none`: keep all heights; or the floor's height in the
-            file, metres.
-
-    Raises:
-        InputError: for the reasons in `pick_joints` and `fit_skeleton`.
-    """
+    """Convert a recording to a clip of the true rate `fps`, Hz, on a body with rest joints (22, 3), metres.
+    `floor` is `auto`: find it from the feet; `none`: keep all heights; or its height in the file, metres.
+    Raises InputError for the reasons in `pick_joints` and `fit_skeleton`."""
     fitted = fit_skeleton(recording, skeleton, rest)
     clip = convert_to_body(fitted, rest, name, fps)
     if floor == AUTO:
@@ -166,10 +146,7 @@ class Retargeting:
 
 def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotion) -> Stance:
     """Find the stance of a file: the rest pose in the map, else the zero pose, else the straightest frame.
-
-    Raises:
-        InputError: if the file has no stance or no such frame, or if left and right contradict each other.
-    """
+    Raises InputError if the file has none of these, or if left and right contradict each other."""
     upright, positions, path = skeleton.upright, motion.positions, recording.path
     stands = (why := anatomy.find_stance_fault(motion.zero)) is None
 
@@ -225,7 +202,6 @@ def _is_untwisted(joint: int, rotations: np.ndarray, zero: np.ndarray) -> bool:
 def _compute_rest(
     recording: Recording, rest: Mapping[str, Sequence[float]] | int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of a map's rest pose."""
     if not isinstance(rest, int):
         return recording.compute_pose(rest)
     if rest >= len(recording):
@@ -237,12 +213,8 @@ def _compute_rest(
 
 
 def fit_skeleton(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Retargeting:
-    """Fit a recording's skeleton to a body's rest joints (22, 3), metres.
-
-    Raises:
-        InputError: if the unit, the up axis or a stance cannot be found, or if left and right contradict each
-            other.
-    """
+    """Fit a recording's skeleton to a body's rest joints (22, 3), metres. Raises InputError if the unit, the
+    up axis or a stance cannot be found, or if left and right contradict each other."""
     skeleton = find_unit_and_up(recording, skeleton)
     motion = pick_joints(recording, skeleton)
     stance = find_stance(recording, skeleton, motion)
@@ -254,19 +226,9 @@ def fit_skeleton(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) 
 
 
 def convert_to_body(fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Clip:
-    """Convert mapped motion to a clip on a body, in the world (Z up).
-
-    The midpoint of the hips has its position in the recording, scaled by the ratio of leg lengths.
-
-    Args:
-        fitted: the result of `fit_skeleton` for this body.
-        rest: the body's rest joints (22, 3), metres.
-        name: the clip's name.
-        fps: the true frame rate, Hz.
-
-    Raises:
-        InputError: if the person is farther than 10 km from the origin.
-    """
+    """Convert mapped motion, fitted to this body with rest joints (22, 3), metres, to a clip in the world (Z
+    up) at a rate in Hz. The midpoint of the hips has its position in the recording, scaled by the ratio of
+    leg lengths. Raises InputError if the person is farther than 10 km from the origin."""
     motion = fitted.motion
     turned = Z_UP @ _aim_segments(motion, motion.rotations @ fitted.corrections, rest)
     hips = fitted.scale * motion.positions[:, list(HIPS)].mean(1) @ Z_UP.T
@@ -294,10 +256,8 @@ def _aim_segments(motion: MappedMotion, turned: np.ndarray, rest: np.ndarray) ->
 
 
 def _align_bend_axes(rotations: np.ndarray, stance: Stance, motion: MappedMotion, rest: np.ndarray) -> None:
-    """Twist thighs and upper arms in place until the knees' and elbows' bending axes fit the recording.
-
-    The axes come from the stance if the limb is bent there, otherwise from the motion.
-    """
+    """Twist thighs and upper arms in place until the knees' and elbows' bending axes fit the recording: in
+    the stance if the limb is bent there, otherwise in the motion."""
     for joint, rest_axis in HINGES.items():
         if joint in stance.untwisted:
             continue
@@ -328,16 +288,9 @@ def _measure_legs(positions: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StanceView:
-    """The stance of a skeleton with all nodes, in metres: Y up, facing +Z, left on +X.
-
-    Attributes:
-        nodes: names of the nodes.
-        parents: index of each node's parent; -1 for the root.
-        positions: positions of the nodes (nodes, 3).
-        mapped: body joint -> index of its node.
-        body: joint positions of the body (22, 3) in the same stance, with the pelvis at the origin.
-        source: a description of the pose in the file.
-    """
+    """The stance of a skeleton with all nodes, in metres: Y up, facing +Z, left on +X. `mapped` is body joint
+    -> index of its node; `body` has the joint positions (22, 3) of the body in the same stance, with the
+    pelvis at the origin."""
 
     nodes: tuple[str, ...]
     parents: tuple[int, ...]
@@ -348,16 +301,8 @@ class StanceView:
 
 
 def view_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> StanceView:
-    """Return the stance that an import uses for a file's skeleton, and the body in this stance.
-
-    Args:
-        recording: the file's motion.
-        skeleton: the file's skeleton map, with the file's spelling of the nodes.
-        rest: the body's rest joints (22, 3), metres.
-
-    Raises:
-        InputError: for the reasons in `convert_recording`.
-    """
+    """Return the stance that an import uses for a file's skeleton, and the body with rest joints (22, 3),
+    metres, in this stance. Raises InputError for the reasons in `convert_recording`."""
     fitted = fit_skeleton(recording, skeleton, rest)
     stance = fitted.stance
     rotations, body = stance.rotations @ fitted.corrections, np.zeros_like(rest)
@@ -371,11 +316,8 @@ def view_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
 
 
 def find_unit_and_up(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap:
-    """Return a copy of the map in which a missing unit or up axis is found from the recording.
-
-    Raises:
-        InputError: if unit or up axis can't be found, or if the map's unit gives implausible leg lengths.
-    """
+    """Return a copy of the map in which a missing unit or up axis is found from the recording. Raises
+    InputError if they can't be found, or if the map's unit gives implausible leg lengths."""
     nodes = {
         joint: recording.nodes.index(node)
         for joint, node in skeleton.joints.items()
@@ -416,12 +358,8 @@ def _find_unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float
 
 
 def _find_up(recording: Recording, trunk: np.ndarray, nodes: dict[str, int]) -> str:
-    """Find the up axis of a file, `y` or `z`.
-
-    Args:
-        recording: the file's motion.
-        trunk: vectors from pelvis to head (N, 3).
-        nodes: body joint -> index of its node."""
+    """Find the up axis of a file, `y` or `z`, given vectors from pelvis to head (N, 3) and body joint ->
+    index of its node."""
     mean = (trunk / np.linalg.norm(trunk, axis=-1, keepdims=True).clip(1e-9)).mean(0)
     along = {"y": float(mean[1]), "z": float(mean[2])}
     moving = max(along, key=lambda axis: along[axis])
@@ -455,17 +393,9 @@ def _find_up(recording: Recording, trunk: np.ndarray, nodes: dict[str, int]) -> 
 
 
 def find_floor(positions: np.ndarray, fps: float) -> float | None:
-    """Find the height of the floor, metres.
-
-    The floor is below nearly all standing toes. In nearly all frames, it is not above the lowest joint.
-
-    Args:
-        positions: joint positions (N, 22, 3), metres, world (Z up).
-        fps: frames per second.
-
-    Returns:
-        The height; None if no toe stands still for long enough.
-    """
+    """Find the height of the floor, metres, from joint positions (N, 22, 3), world (Z up): below nearly all
+    standing toes, and in nearly all frames not above the lowest joint. None if no toe stands still for long
+    enough."""
     toes = positions[:, list(FEET.values())]
     if len(toes) < 2:
         return None
@@ -478,11 +408,9 @@ def find_floor(positions: np.ndarray, fps: float) -> float | None:
 
 
 def measure_first_step(recording: Recording) -> float:
-    """Measure the step from frame 0 to frame 1, relative to the 90 % quantile of all later steps.
-
-    A step is the maximum distance that a node moves relative to the root. The result is 0 for a short
-    recording or a small step. Above `JUMP`, frame 0 is a calibration pose, such as a T-pose.
-    """
+    """Measure the step from frame 0 to frame 1, relative to the 90 % quantile of all later steps. A step is
+    the maximum distance that a node moves relative to the root. The result is 0 for a short recording or a
+    small step. Above `JUMP`, frame 0 is a calibration pose, such as a T-pose."""
     if len(recording) < 4:
         return 0.0
     positions = recording.compute_kinematics()[1]

@@ -1,8 +1,6 @@
-"""Checks an import: compares a clip with its recording, and with human anatomy.
-
-The check does not use the constants of the conversion. Forward kinematics poses the clip on a body. The
-positions for the comparison come directly from the file.
-"""
+"""Checks an import: compares a clip with its recording, and with human anatomy. The constants of the
+conversion are not used: forward kinematics poses the clip, and the positions to compare come directly from
+the file."""
 
 from __future__ import annotations
 
@@ -47,13 +45,7 @@ STRETCH = 0.02  # metres: maximum change of a segment's length
 
 
 class LargestError(NamedTuple):
-    """The largest of several errors, and its place.
-
-    Attributes:
-        value: the error.
-        where: name of the joint or segment.
-        frame: index of the frame.
-    """
+    """The largest of several errors, the name of its joint or segment, and the index of its frame."""
 
     value: float
     where: str
@@ -86,13 +78,8 @@ class Fidelity:
 
 
 def compare_with_recording(clip: Clip, motion: MappedMotion, rest: np.ndarray, skeleton: str) -> Fidelity:
-    """Compare a clip with the mapped motion of its recording.
-
-    Args:
-        clip: the clip.
-        motion: the mapped motion from which the clip was made.
-        rest: rest joints of the clip's body (22, 3), metres.
-        skeleton: name of the skeleton map."""
+    """Compare a clip on a body with rest joints (22, 3), metres, with the mapped motion from which it was
+    made. `skeleton` is the name of its map."""
     rotations, positions = compute_clip_kinematics(clip, rest)
     expected, mapped = motion.positions @ Z_UP.T, motion.mapped
     mm, degrees = (
@@ -111,11 +98,9 @@ def compare_with_recording(clip: Clip, motion: MappedMotion, rest: np.ndarray, s
 
 
 def _measure_distance(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> LargestError:
-    """Measure the maximum distance, mm, between joints in the file and joints from a clip's rotations.
-
-    In its parent joint's frame, each bone has a constant direction, which is its mean over all frames. So a
-    distance arises if the clip's rotations differ from the file's.
-    """
+    """Measure the maximum distance, mm, between joints in the file and joints from a clip's rotations. In its
+    parent joint's frame, each bone has a constant direction, which is its mean over all frames. So a distance
+    arises if the clip's rotations differ from the file's."""
     posed = expected.copy()
     for joint in np.flatnonzero(mapped)[1:]:
         parent = PARENTS[joint]
@@ -143,7 +128,6 @@ def _measure_deviation(positions: np.ndarray, expected: np.ndarray, mapped: np.n
 
 
 def _find_largest_error(errors: np.ndarray, names: list[str] | tuple[str, ...]) -> LargestError:
-    """Find the largest error in an array (N, len(names))."""
     frame, column = np.unravel_index(int(errors.argmax()), errors.shape)
     return LargestError(float(errors[frame, column]), names[column], int(frame))
 
@@ -179,7 +163,6 @@ def _find_hip_faults(motion: MappedMotion) -> Iterator[str]:
 
 
 def _find_turn_faults(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str]:
-    """Yield descriptions of implausible joint rotations and twisted limbs."""
     turns = [compute_angles(rotations[:, HEAD, :, axis], rotations[:, CHEST, :, axis]) for axis in (1, 2)]
     odd = np.max(turns, axis=0) > HEAD_TURN
     if odd.mean() > HEAD_SHARE:

@@ -2,8 +2,7 @@
 
 Joints of arms and legs are found by typical words, each below the previous joint. The spine joints are spread
 over the nodes between pelvis and arms. The head is a node named head, or else the end of the longest chain
-above the arms.
-"""
+above the arms."""
 
 from __future__ import annotations
 
@@ -52,12 +51,7 @@ class NodeName(NamedTuple):
 
 @dataclass(frozen=True)
 class MapGuess:
-    """A proposed map.
-
-    Attributes:
-        skeleton: the map.
-        by_tree: the joints that were found by the tree instead of by names.
-    """
+    """A proposed map, and the joints that were found by the tree instead of by names."""
 
     skeleton: SkeletonMap
     by_tree: tuple[str, ...]
@@ -69,13 +63,8 @@ class MapGuess:
 
 
 def split_node_name(name: str) -> NodeName:
-    """Split a node's name without namespace into side and word.
-
-    The side letter in names like `lfemur` is split off only if the rest is a known word.
-
-    Args:
-        name: such as `LeftUpLeg`, `lShldr`, `UpperArm_L`, `thigh.r`, `lfemur`.
-    """
+    """Split a node's name without namespace, such as `LeftUpLeg`, `UpperArm_L` or `lfemur`, into side and
+    word. A side letter as in `lfemur` is split off only if the rest is a known word."""
     tokens = [token.lower() for token in TOKENS.findall(name.removesuffix(END))]
     sides = {SIDES[token] for token in tokens if token in SIDES}
     if len(sides) == 1:
@@ -88,11 +77,7 @@ def split_node_name(name: str) -> NodeName:
 
 
 def guess_map(recording: Recording, name: str) -> MapGuess:
-    """Propose a map for a file.
-
-    Args:
-        recording: the file.
-        name: name of the map."""
+    """Propose a map with this name for a file."""
     tree = _Tree(recording)
     node_of: dict[str, int] = {}
     for side in ("left", "right"):
@@ -177,11 +162,7 @@ class _Tree:
 
 
 def convert_with_guess(recording: Recording, proposed: MapGuess) -> Conversion:
-    """Convert a file to the built-in body with a proposed map.
-
-    Raises:
-        InputError: if the file can't be imported with the proposed map.
-    """
+    """Convert a file to the built-in body with a proposed map. Raises InputError if this fails."""
     if missing := ", ".join(proposed.missing):
         raise InputError(f"joints.{proposed.missing[0]}: not found; add {missing} to the map")
     name = proposed.skeleton.name

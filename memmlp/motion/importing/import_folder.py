@@ -42,26 +42,11 @@ from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_
 
 @dataclass(frozen=True)
 class ImportedClip:
-    """One imported clip.
-
-    Attributes:
-        source: the file's path below its folder.
-        sha256: SHA-256 of the source file.
-        clip: the npz file's path below the output folder.
-        skeleton: name of the skeleton map.
-        unit: the file's unit, metres.
-        up: the file's up axis, `y` or `z`.
-        stance: a description of the stance.
-        frames: number of frames.
-        header_fps: frame rate in the file's header, Hz; None if the header has no rate.
-        fps: frame rate of the clip, Hz.
-        fps_reason: a description of the rate's origin.
-        floor: the subtracted height of the floor, metres at the body's scale; None if nothing was subtracted.
-        scale: the body's size divided by the size in the file.
-        first_step: the step from frame 0 to frame 1, relative to later steps (`convert.measure_first_step`);
-            0 if the map excludes frame 0.
-        faults: the clip's likely mistakes, one sentence each (`fidelity.Fidelity`).
-    """
+    """One imported clip, as written to the record. `source` and `clip` are paths below the folders; `unit` is
+    the file's in metres, `up` its axis, `y` or `z`; rates are in Hz, `header_fps` None if the header has
+    none; `floor` is the subtracted height, metres at the body's scale, or None; `scale` is the body's size
+    divided by that in the file; `first_step` is that of `convert.measure_first_step`, 0 if the map excludes
+    frame 0; `faults` are those of `Fidelity`."""
 
     source: str
     sha256: str
@@ -82,13 +67,8 @@ class ImportedClip:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """The report of an import.
-
-    Attributes:
-        clips: the clips that were written.
-        notes: notes for the user, such as corrected frame rates.
-        skipped: the files that were skipped.
-    """
+    """The report of an import: the written clips, notes for the user, such as corrected frame rates, and
+    skipped files."""
 
     clips: tuple[ImportedClip, ...]
     notes: tuple[str, ...]
@@ -121,16 +101,8 @@ class ImportSettings:
 
 def import_folder(source: Path, out: Path, settings: ImportSettings | None = None) -> ImportReport:
     """Import each file of a folder, or a single file, as OUT/RELATIVE_PATH.npz, and write OUT/import.json.
-
-    Args:
-        source: folder or file.
-        out: output folder, without clips of other imports.
-        settings: the settings.
-
-    Raises:
-        InputError: if there are no files, several files have one name, a rate has an unknown folder, `out`
-            has clips of a different import or cannot be written, or no file can be imported. Then nothing is
-            written.
+    Raises InputError if there are no files, several files have one name, a rate has an unknown folder, `out`
+    has clips of a different import or cannot be written, or no file can be imported. Then nothing is written.
     """
     settings, files = settings or ImportSettings(), find_recordings(source)
     _check_import(files, out, settings)
@@ -158,18 +130,9 @@ def import_folder(source: Path, out: Path, settings: ImportSettings | None = Non
 
 
 def verify_folder(source: Path, settings: ImportSettings | None = None) -> Iterator[Fidelity | SkippedFile]:
-    """Import each file of a folder, or a single file, without writing it, and compare clip and file.
-
-    Args:
-        source: folder or file.
-        settings: the settings.
-
-    Yields:
-        For each file the comparison, or the reason why the file cannot be imported.
-
-    Raises:
-        InputError: if there are no files, or the skeleton or body does not exist.
-    """
+    """Import each file of a folder, or a single file, without writing it. Yield for each file the comparison
+    of clip and file, or the reason why it cannot be imported. Raises InputError if there are no files, or the
+    skeleton or body does not exist."""
     settings = settings or ImportSettings()
     rest = load_rest_joints(settings.body)
     for relative, result in _convert_all(find_recordings(source), settings, rest):
@@ -253,12 +216,10 @@ def _describe_clip(relative: Path, result: _ConvertedFile) -> ImportedClip:
 
 
 def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, str]) -> None:
-    """Move the clips and the record from the staging folder to `out`; remove old clips of skipped files.
-
-    If `out` is new, the staging folder is renamed, so `out` is complete at once. Otherwise the old record is
+    """Move the clips and the record from the staging folder to `out`; remove old clips of skipped files. If
+    `out` is new, the staging folder is renamed, so `out` is complete at once. Otherwise the old record is
     removed first, and the new record is written last. A folder without a record is therefore incomplete: it
-    may have clips of two imports.
-    """
+    may have clips of two imports."""
     record = {**body, **asdict(report)}
     atomic_write(staging / RECORD, json.dumps(record, indent=1) + "\n")
     if not out.exists():

@@ -1,8 +1,5 @@
-"""Finds and reads recordings, and finds their true frame rates.
-
-To add a format, write a module in `memmlp.motion.formats` with a function `read(path) -> Recording`, and add
-the function to `READERS`.
-"""
+"""Finds and reads recordings, and finds their true frame rates. To add a format, write a module in
+`memmlp.motion.formats` with a function `read(path) -> Recording`, and add it to `READERS`."""
 
 from __future__ import annotations
 
@@ -30,12 +27,7 @@ DIGITS = 16  # number of digits of a file's digest in known_rates.yaml
 
 
 class Rate(NamedTuple):
-    """A frame rate.
-
-    Attributes:
-        fps: frames per second.
-        reason: where the rate comes from, for messages.
-    """
+    """A frame rate, Hz, and where it comes from, for messages."""
 
     fps: float
     reason: str
@@ -45,14 +37,8 @@ DATABASES = Rate(120.0, "the rate of CMU and HDM05, because AMC files do not hav
 
 
 def find_recordings(source: Path) -> dict[Path, Path]:
-    """Find the recordings of a folder, or a single recording.
-
-    Returns:
-        Path below the folder -> path, sorted.
-
-    Raises:
-        InputError: if the folder or file is missing, or the folder has no recordings.
-    """
+    """Find the recordings of a folder, or a single recording: path below the folder -> path, sorted. Raises
+    InputError if the folder or file is missing, or the folder has no recordings."""
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; {EXPECTED}")
     top = source if source.is_dir() else source.parent
@@ -71,19 +57,10 @@ def read_recording(path: Path) -> Recording:
 
 
 def find_rate(recording: Recording, relative: Path, user_rates: Mapping[str, float]) -> Rate:
-    """Find the true frame rate: the user's, a known file's, the index's, the header's, or else 120 Hz.
-
-    An index is a CSV file `*index.csv` in the file's folder, or in one above it up to the imported folder. It
-    has the columns of the CMU database's index; its row of a file is found by the name `SUBJECT_TRIAL`.
-
-    Args:
-        recording: the recording.
-        relative: the file's path below the imported folder.
-        user_rates: folder below the imported folder ("" for all) -> rate, Hz.
-
-    Raises:
-        InputError: if an index is damaged.
-    """
+    """Find the true frame rate: the user's (folder below the imported one, "" for all -> Hz), a known file's,
+    the index's, the header's, or else 120 Hz. An index is a CSV file `*index.csv` in the file's folder, or in
+    one above it up to the imported folder. It has the columns of the CMU database's index; its row of a file
+    is found by the name `SUBJECT_TRIAL`. Raises InputError if an index is damaged."""
     for folder in relative.parents:
         if (key := make_folder_key(folder)) in user_rates:
             return Rate(float(user_rates[key]), f"set for {key or 'all'}")

@@ -66,11 +66,8 @@ def list_shipped_skeletons() -> tuple[str, ...]:
 
 
 def load_skeleton(which: str) -> SkeletonMap:
-    """Load a shipped map, given its name, or the user's map, given its path.
-
-    Raises:
-        InputError: if the map does not exist or is invalid.
-    """
+    """Load a shipped map, given its name, or the user's map, given its path. Raises InputError if it does not
+    exist or is invalid."""
     path = SKELETONS / f"{which}.yaml" if which in list_shipped_skeletons() else Path(which)
     if not path.is_file():
         names = ", ".join(list_shipped_skeletons())
@@ -85,16 +82,11 @@ def load_skeleton(which: str) -> SkeletonMap:
 
 
 def find_skeleton(recording: Recording, user_map: SkeletonMap | None = None) -> SkeletonMap:
-    """Find the skeleton map for a file, and adapt it to the file's spelling of nodes.
-
-    A map fits if the file has all of its nodes. Spelling and namespaces may differ (`find_nodes`). Of several
-    maps that fit, the map with the largest number of nodes is chosen. If these numbers are equal, a map
-    without a fixed unit and up axis is preferred. The user's map is always chosen; it stays unchanged if it
-    does not fit.
-
-    Raises:
-        InputError: if no map fits, or several maps fit equally well.
-    """
+    """Find the skeleton map for a file, and adapt it to the file's spelling of nodes. A map fits if the file
+    has all of its nodes. Spelling and namespaces may differ (`find_nodes`). Of several maps that fit, the map
+    with the largest number of nodes is chosen, then one without a fixed unit and up axis. The user's map is
+    always chosen; it stays unchanged if it does not fit. Raises InputError if no map fits, or several maps
+    fit equally well."""
     if user_map is not None:
         return _respell(user_map, recording) or user_map
     maps = _load_shipped(SKELETONS)
@@ -137,11 +129,9 @@ def _respell(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
 
 
 def strip_namespace(nodes: Sequence[str]) -> list[str]:
-    """Remove common prefixes of node names, such as `mixamorig:`, `Character1_` or `m_avg_`.
-
-    A prefix with a colon is always removed. The root may lack the others' prefix. If the resulting names are
-    not unique, the names stay unchanged.
-    """
+    """Remove common prefixes of node names, such as `mixamorig:`, `Character1_` or `m_avg_`. A prefix with a
+    colon is always removed. The root may lack the others' prefix. If the resulting names are not unique, the
+    names stay unchanged."""
     plain = [re.sub(r".*[:|]", "", node) for node in nodes]
     for names in (plain, plain[1:]):
         prefix = _find_prefix(names) if len(names) > 1 else ""
@@ -161,14 +151,9 @@ def _find_prefix(names: Sequence[str]) -> str:
 
 
 def find_nodes(nodes: Sequence[str], names: Sequence[str]) -> dict[str, str] | None:
-    """Find the node for each name of a skeleton map.
-
-    A node with the same spelling is preferred. Otherwise exactly one node must have an equivalent spelling:
-    `Left_hip`, `left_hip` and `x:LeftHip` are equivalent.
-
-    Returns:
-        The node by name; None if a name has no node, or two names have the same node.
-    """
+    """Find the node for each name of a skeleton map: the one with the same spelling, or else exactly one with
+    an equivalent spelling: `Left_hip`, `left_hip` and `x:LeftHip` are equivalent. None if a name has no node,
+    or two names have the same node."""
     keys = [_normalize_name(name) for name in strip_namespace(nodes)]
     count = Counter(keys)
     unique = {key: node for key, node in zip(keys, nodes, strict=True) if count[key] == 1}
@@ -197,8 +182,6 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def _parse_map(path: Path, content: object) -> SkeletonMap:
-    """Parse the content of a YAML map. Raises InputError for invalid values."""
-
     def require(good: bool, key: str, expected: str) -> None:
         if not good:
             raise InputError(f"{path}: {key} must be {expected}")
@@ -279,12 +262,8 @@ class MappedMotion:
 
 
 def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
-    """Select the motion of the mapped joints in a recording, without a calibration frame.
-
-    Raises:
-        InputError: if nodes of the map are missing, the order of nodes differs from the body's, or no frame
-            remains.
-    """
+    """Select the motion of the mapped joints in a recording, without a calibration frame. Raises InputError
+    if nodes of the map are missing, the order of nodes differs from the body's, or no frame remains."""
     if missing := sorted(set(skeleton.joints.values()) - set(recording.nodes)):
         raise InputError(
             f"{recording.path}: has no {', '.join(missing)}; required by skeleton {skeleton.name}"

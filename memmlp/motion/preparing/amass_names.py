@@ -75,14 +75,9 @@ def find_present_subsets(names: Iterable[str]) -> set[str]:
 
 
 def describe_absent_subsets(data: str, names: Iterable[str]) -> str:
-    """Describe the missing subsets of a protocol, as in "1 of 3 subsets (without CMU, MPI_HDM05)".
-
-    The text is empty if no subset is missing or the data has no protocol.
-
-    Args:
-        data: the option of `data`.
-        names: names of clips or folders.
-    """
+    """Describe the missing subsets of a protocol (option of `data`), given names of clips or folders, as in
+    "1 of 3 subsets (without CMU, MPI_HDM05)". The text is empty if none is missing or the data has no
+    protocol."""
     protocol, present = PROTOCOLS.get(data, ()), find_present_subsets(names)
     absent = [name for name in protocol if normalize_subset(name) not in present]
     if not absent:

@@ -36,17 +36,10 @@ CHUNK = 4096  # maximum number of frames that are converted at a time
 
 @dataclass(frozen=True)
 class ClipFolder:
-    """The source of a cache: one or more folders of clips, and the settings.
-
-    Attributes:
-        root: folder with npz files at any depth, or several named folders.
-        split: the split into train, val and test.
-        body: "builtin" or the path of an SMPL-H model.npz.
-        min_frames: minimum number of frames at 60 Hz; shorter clips are skipped. 42 frames give T = 41
-            inputs.
-        strict: whether a bad file raises InputError; otherwise it is skipped.
-        interpolation: method of resampling to 60 Hz, one of `INTERPOLATIONS`.
-    """
+    """The source of a cache: `root` is a folder with npz files at any depth, or several named folders; `body`
+    is "builtin" or an SMPL-H model.npz. Clips with fewer frames at 60 Hz than `min_frames` are skipped; 42
+    frames give T = 41 inputs. A bad file is skipped, or with `strict` raises InputError. `interpolation` is
+    one of `INTERPOLATIONS`."""
 
     root: Root
     split: Split
@@ -57,13 +50,9 @@ class ClipFolder:
 
 
 def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
-    """Prepare the cache in the folder `out`, unless it is current. Only one process does so at a time.
-
-    Raises:
-        InputError: if the root has no usable clips, the split is impossible, the folder cannot be written, or
-            a file is bad and `strict` is set.
-        OSError: if the disk is full or read-only.
-    """
+    """Prepare the cache in the folder `out`, unless it is current. Only one process does so at a time. Raises
+    InputError if the root has no usable clips, the split is impossible, the folder cannot be written, or a
+    file is bad and `strict` is set; OSError if the disk is full or read-only."""
     source = replace(source, body=str(source.body))
     if source.min_frames < 2:
         raise InputError(
@@ -98,7 +87,6 @@ def load_finished_cache(source: ClipFolder, out: Path) -> Manifest | None:
 
 
 def _plan_cache(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
-    """Read the clips, split them, and return the manifest of the cache to write."""
     from memmlp.motion.preparing.duplicates import assign_parts  # scipy takes 0.4 s to import
     from memmlp.motion.preparing.survey import survey_folder
 
@@ -214,10 +202,8 @@ def _compute_request_digest(source: ClipFolder, rest: np.ndarray) -> str:
 
 
 def _read_stamp(path: Path) -> tuple[int, int, int]:
-    """Return size, modification time and change time of a file; zeros for a dangling link.
-
-    Archives can set the modification time, but not the change time.
-    """
+    """Return size, modification time and change time of a file; zeros for a dangling link. Archives can set
+    the modification time, but not the change time."""
     try:
         stat = path.stat()
     except OSError:

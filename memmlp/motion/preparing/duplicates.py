@@ -49,11 +49,8 @@ SIGNS = (
 def assign_parts(
     split: Split, clips: Sequence[ClipRecord]
 ) -> tuple[dict[str, str | None], dict[str, str], dict[str, str]]:
-    """Return the clips' parts, their groups, and the dropped copies: clip -> the copy that stays.
-
-    Raises:
-        InputError: if the split is impossible.
-    """
+    """Return the clips' parts, their groups, and the dropped copies: clip -> the copy that stays. Raises
+    InputError if the split is impossible."""
     assignment = split.assign([clip.name for clip in clips])
     groups = merge_groups(clips, assignment.groups)
     if split.copies_give_way or groups == assignment.groups:
@@ -69,15 +66,8 @@ def assign_parts(
 def drop_copies_across_parts(
     clips: Sequence[ClipRecord], parts: Mapping[str, str | None]
 ) -> tuple[dict[str, str | None], dict[str, str]]:
-    """Keep the copies of each clip in one part only: test before val before train.
-
-    Args:
-        clips: the clips with their content.
-        parts: clip -> its part, or None.
-
-    Returns:
-        The new parts, with None for dropped clips, and the dropped clips: clip -> the copy that stays.
-    """
+    """Keep the copies of each clip in one part only: test before val before train. Return the new parts, with
+    None for dropped clips, and the dropped clips: clip -> the copy that stays."""
     kept, gave_way = dict(parts), {}
     for names in _list_copies(clips):
         last = max((PARTS.index(part) for name in names if (part := parts[name])), default=0)
@@ -126,10 +116,8 @@ def mirror_clip(clip: Clip) -> Clip:
 
 
 def compute_first_frames(clip: Clip) -> np.ndarray:
-    """Return the rotations and position in the first frame of a clip and of its mirror image (2, 201).
-
-    Copies at different frame rates have equal first frames.
-    """
+    """Return the rotations and position in the first frame of a clip and of its mirror image (2, 201). Copies
+    at different frame rates have equal first frames."""
     start = replace(clip, poses=clip.poses[:1], trans=clip.trans[:1])
     rows = []
     for one in (start, mirror_clip(start)):
@@ -141,13 +129,8 @@ def compute_first_frames(clip: Clip) -> np.ndarray:
 def find_resampled_copies(
     root: Root, clips: Sequence[ClipRecord], firsts: Mapping[str, np.ndarray]
 ) -> Iterator[tuple[ClipRecord, ClipRecord]]:
-    """Yield pairs of clips with the same motion at different frame rates.
-
-    Args:
-        root: the folder of the clips.
-        clips: records of valid clips.
-        firsts: clip -> its original and mirrored first frame (`compute_first_frames`).
-    """
+    """Yield pairs of clips with the same motion at different frame rates. `firsts` has clip -> its original
+    and mirrored first frame (`compute_first_frames`)."""
     moving = sorted((clip for clip in clips if clip.content != STILL), key=lambda clip: clip.length)
     if len({clip.fps for clip in moving}) < 2:
         return
@@ -181,16 +164,10 @@ def _is_same_motion(one: Clip, other: Clip) -> bool:
 
 
 class MarkedFrames(NamedTuple):
-    """Marked frames of a clip at 60 Hz, or of its mirror image.
-
-    A fixed weighted sum of the rotations is computed for each frame. Its local extrema within a quarter of a
-    second on either side are marked. They depend only on the motion, so clips that share motion have
-    corresponding marked frames.
-
-    Attributes:
-        frames: indices (M,) of the marked frames.
-        signatures: weighted sums of the frames' rotations (M, 24), which are similar for similar poses.
-    """
+    """Marked frames of a clip at 60 Hz, or of its mirror image: indices (M,), and weighted sums of their
+    rotations (M, 24), which are similar for similar poses. Frames are marked at the local extrema, within a
+    quarter of a second on either side, of a fixed weighted sum of the rotations. They depend only on the
+    motion, so clips that share motion have corresponding marked frames."""
 
     frames: np.ndarray
     signatures: np.ndarray
@@ -230,10 +207,8 @@ def _mark_rotations(turns: np.ndarray) -> MarkedFrames:
 
 
 def _interpolate_extrema(sums: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Interpolate sums (N, 24) at the extrema of the first sum, which may lie between two frames.
-
-    So the result (M, 24) does not depend on the sampling times.
-    """
+    """Interpolate sums (N, 24) at the extrema of the first sum, which may lie between two frames. So the
+    result (M, 24) does not depend on the sampling times."""
     before, at, after = sums[frames - 1], sums[frames], sums[frames + 1]
     slope, curvature = (after - before) / 2, after - 2 * at + before
     shift = np.divide(-slope[:, 0], curvature[:, 0], out=np.zeros(len(frames)), where=curvature[:, 0] != 0)
@@ -249,15 +224,9 @@ def _measure_angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def find_shared_stretches(
     root: Root, clips: Sequence[ClipRecord], marks: Mapping[str, tuple[MarkedFrames, MarkedFrames]]
 ) -> Iterator[tuple[ClipRecord, ClipRecord]]:
-    """Yield pairs of clips that share a stretch of motion and have different `content`.
-
-    Marked frames with similar signatures are found first. Then the frames around them are compared.
-
-    Args:
-        root: the folder of the clips.
-        clips: records of valid clips.
-        marks: clip -> its original and mirrored marked frames (`mark_frames`).
-    """
+    """Yield pairs of clips that share a stretch of motion and have different `content`. `marks` has clip ->
+    its original and mirrored marked frames (`mark_frames`). The frames around those with similar signatures
+    are compared."""
 
     @lru_cache(maxsize=16)
     def read_rotations(index: int) -> np.ndarray:
@@ -285,10 +254,8 @@ def find_shared_stretches(
 
 def _has_same_rotations(one: np.ndarray, frame: int, other: np.ndarray, other_frame: int) -> bool:
     """Return whether two clips have equal rotations around one frame of each clip, forwards or backwards.
-
     Extrema are flat, so frame indices are uncertain by one. If both clips were sampled from a higher rate,
-    the frames of one clip may lie between the frames of the other.
-    """
+    the frames of one clip may lie between the frames of the other."""
     first = one[frame - REACH : frame + REACH + 1]
     near = other[max(other_frame - REACH - 1, 0) : other_frame + REACH + 2]
     between = (near[1:] + near[:-1]) / 2
@@ -332,13 +299,8 @@ def mark_turns(clip: Clip) -> MarkedFrames:
 def find_conversions(
     root: Root, clips: Sequence[ClipRecord], marks: Mapping[str, MarkedFrames]
 ) -> Iterator[tuple[ClipRecord, ClipRecord]]:
-    """Yield pairs of clips that are conversions of one take and have different `content`.
-
-    Args:
-        root: the folder of the clips.
-        clips: records of valid clips.
-        marks: clip -> its marked frames (`mark_turns`).
-    """
+    """Yield pairs of clips that are conversions of one take and have different `content`. `marks` has clip ->
+    its marked frames (`mark_turns`)."""
     owners = np.repeat(np.arange(len(clips)), [len(marks[clip.name].frames) for clip in clips])
     if not len(owners):
         return

@@ -14,11 +14,7 @@ SUFFIX = ".npz"  # in any letter case
 
 @dataclass(frozen=True)
 class NamedFolders:
-    """Named folders of clips that can replace one folder's path: `folders / "cmu/salsa/01.npz"`.
-
-    Attributes:
-        sources: name -> folder.
-    """
+    """Folders of clips by name that can replace one folder's path: `folders / "cmu/salsa/01.npz"`."""
 
     sources: Mapping[str, Path]
 
@@ -57,24 +53,16 @@ Root = Path | NamedFolders
 
 @dataclass
 class FolderContent:
-    """The content of a folder, with relative paths.
-
-    Attributes:
-        files: the npz files, sorted. Of several paths of a file, the shortest is listed, and real before
-            linked paths.
-        unreadable: folder that cannot be listed -> the reason.
-    """
+    """The content of a folder, with relative paths: the sorted npz files, and folder that cannot be listed ->
+    the reason. Of several paths of a file, the shortest is listed, and real before linked paths."""
 
     files: list[str] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
 
 
 def find_clips(root: Root) -> FolderContent:
-    """Find the npz files below one or more folders. Links are followed, and hidden files are ignored.
-
-    Raises:
-        InputError: if a folder does not exist or has no npz files.
-    """
+    """Find the npz files below one or more folders. Links are followed, and hidden files are ignored. Raises
+    InputError if a folder does not exist or has no npz files."""
     if isinstance(root, Path):
         return _find_in_folder(root)
     result = FolderContent()

@@ -28,13 +28,8 @@ KEY = "data.split.groups_file"
 
 @dataclass(frozen=True)
 class Grouping:
-    """The rules that group clips.
-
-    Attributes:
-        patterns: regular expressions for clip names.
-        rows: clip name -> its group in the column file; None without a file.
-        file: the column file, for messages.
-    """
+    """The rules that group clips: regular expressions for clip names, and clip name -> its group in the
+    column file."""
 
     patterns: Sequence[str] = ()
     rows: Mapping[str, str] | None = None
@@ -42,11 +37,8 @@ class Grouping:
 
     @classmethod
     def from_settings(cls, patterns: Sequence[str], file: Path | str | None) -> Grouping:
-        """Make a grouping from patterns and an optional column file.
-
-        Raises:
-            InputError: if the file can't be read or has an invalid line.
-        """
+        """Make a grouping from patterns and an optional column file. Raises InputError if the file can't be
+        read or has an invalid line."""
         return cls(tuple(patterns), read_groups(Path(file)) if file else None, Path(file) if file else None)
 
     @property
@@ -57,15 +49,8 @@ class Grouping:
         return hashlib.sha256(json.dumps(sorted(self.rows.items())).encode()).hexdigest()
 
     def check(self, names: Collection[str], files: Iterable[str]) -> None:
-        """Check that the column file lists every clip of the split, and only existing files.
-
-        Args:
-            names: names of the clips to split.
-            files: names of all files, including invalid ones.
-
-        Raises:
-            InputError: if a clip is missing in the column file, or a listed clip has no file.
-        """
+        """Raise InputError unless the column file lists every clip of the split (`names`), and only existing
+        `files`."""
         if self.rows is None:
             return
         for problem, clips in (
@@ -77,14 +62,9 @@ class Grouping:
                 raise InputError(f"{KEY}={self.file}: {problem} {min(clips)}{more}")
 
     def group_clips(self, aliases: Mapping[str, str]) -> list[list[str]]:
-        """Group clips. Membership is transitive: overlapping groups are merged.
-
-        Args:
-            aliases: clip name -> the name that patterns match and that determines the order in a group.
-
-        Raises:
-            InputError: if a pattern is not a regular expression.
-        """
+        """Group clips. Membership is transitive: overlapping groups are merged. `aliases` has clip name ->
+        the name that patterns match and that determines the order in a group. Raises InputError for an
+        invalid pattern."""
         try:
             compiled = [re.compile(pattern) for pattern in self.patterns]
         except re.error as error:
@@ -111,13 +91,9 @@ class Grouping:
 
 
 def read_groups(file: Path) -> dict[str, str]:
-    """Read a column file: CSV with the columns `clip` and `group`. Other columns are ignored.
-
-    The column `clip` has paths below the data folder, with or without `.npz`.
-
-    Raises:
-        InputError: if the file can't be read or has an invalid line.
-    """
+    """Read a column file: CSV with the columns `clip` (paths below the data folder, with or without `.npz`)
+    and `group`. Other columns are ignored. Raises InputError if the file can't be read or has an invalid
+    line."""
     try:
         with open(file, encoding="utf-8-sig", newline="") as stream:
             table = csv.DictReader(stream)
@@ -152,11 +128,9 @@ def find_root(parents: dict[Any, Any], node: Any) -> Any:
 
 
 def describe_divided_folders(manifest: Manifest) -> str:
-    """Describe folders with ungrouped clips in both training and test; empty if there are none.
-
-    Such a folder often belongs to one person or session, unless it contains all clips of its source.
-    Published lists are not checked.
-    """
+    """Describe folders with ungrouped clips in both training and test; empty if there are none. Such a folder
+    often belongs to one person or session, unless it contains all clips of its source. Published lists are
+    not checked."""
     if manifest.split.get("kind") == "lists":
         return ""
     records = {clip.name: clip for clip in manifest.clips}
@@ -187,12 +161,8 @@ def describe_divided_folders(manifest: Manifest) -> str:
 
 
 def describe_unmatched_patterns(split: Mapping[str, Any], names: Collection[str]) -> str:
-    """Describe group patterns that match no clip; empty if at least one pattern matches.
-
-    Args:
-        split: the split's settings (`Split.describe`).
-        names: names of the clips.
-    """
+    """Describe group patterns of a split (`Split.describe`) that match no clip; empty if at least one
+    matches."""
     remarks = []
     for prefix, own, below in _split_by_source(split, names):
         patterns = own.get("groups", ())

@@ -26,21 +26,11 @@ STILL = "still"  # `content` of all clips without motion
 
 @dataclass(frozen=True)
 class ClipRecord:
-    """A clip in the cache.
-
-    Attributes:
-        name: path below the data root without suffix.
-        file: path below the data root.
-        split: its part, "train", "val" or "test".
-        group: name of the clip's group (`Grouping.name_groups`); the clip's name without other members.
-        start: the clip's first frame in its part's array.
-        length: the clip's number of frames in that array.
-        sha256: digest of the source file.
-        content: digest of the frames in single precision, equal for all copies and for clips with common
-            motion (`duplicates`); `STILL` for a clip without motion.
-        fps: frame rate of the source, Hz.
-        resampling: the method of resampling to 60 Hz (`clip.resample`).
-    """
+    """A clip in the cache. `name` and `file` are paths below the data root, `split` is its part, `group` that
+    of `Grouping.name_groups`; `start` and `length` locate its frames in the part's array. `sha256` is the
+    digest of the source file, `content` that of the frames in single precision, equal for all copies and for
+    clips with common motion (`duplicates`); `STILL` for a clip without motion. `fps` is the source's rate,
+    Hz, `resampling` the method (`clip.resample`)."""
 
     name: str
     file: str
@@ -76,12 +66,8 @@ def name_copies(clips: Iterable[ClipRecord]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Coverage:
-    """The numbers of a split's entries (list entries, subsets) with and without a clip.
-
-    Attributes:
-        entry_counts: subset -> number of entries; empty for a split that divides all clips in the folder.
-        missing_counts: subset -> number of entries without a clip; complete subsets are omitted.
-    """
+    """The numbers of a split's entries (list entries, subsets) by subset, and of those without a clip;
+    complete subsets are omitted. Both are empty for a split that divides all clips in the folder."""
 
     entry_counts: Mapping[str, int]
     missing_counts: Mapping[str, int]
@@ -169,11 +155,7 @@ class Manifest:
 
     @classmethod
     def load(cls, out: Path) -> Manifest:
-        """Load the manifest of a cache.
-
-        Raises:
-            InputError: if there is no finished cache of this format.
-        """
+        """Load the manifest of a cache. Raises InputError if there is no finished cache of this format."""
         path = out / MANIFEST
         try:
             data = json.loads(path.read_text(encoding="utf-8"))

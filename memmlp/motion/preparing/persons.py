@@ -13,13 +13,7 @@ from memmlp.motion.preparing.splits import Assignment, Split, make_sort_key
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of motion, and the persons who performed it.
-
-    Attributes:
-        persons: ids of the persons.
-        test: number of these persons in test.
-        val: number of these persons in validation.
-    """
+    """A kind of motion: the ids of its persons, and how many of them are in test and in validation."""
 
     persons: Sequence[str]
     test: int
@@ -85,11 +79,8 @@ class PersonSplit(Split):
         )
 
     def identify_person(self, name: str) -> str | None:
-        """Return the id of the person in a clip; None if the clip is left out.
-
-        Raises:
-            InputError: if the clip matches no pattern.
-        """
+        """Return the id of the person in a clip; None if the clip is left out. Raises InputError if the clip
+        matches no pattern."""
         for pattern, person in self.persons.items():
             if match := re.search(pattern, name):
                 return person and match.expand(person)

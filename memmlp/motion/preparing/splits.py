@@ -34,12 +34,8 @@ LISTED = ("train", "test")  # the parts with published lists
 
 @dataclass(frozen=True)
 class Assignment:
-    """The result of a split.
-
-    Attributes:
-        parts: clip name -> "train", "val", "test", or None for a clip that is left out.
-        groups: clip name -> name of its group; the clip's name without other members.
-    """
+    """The result of a split: clip name -> "train", "val", "test", or None (left out); and clip name -> name
+    of its group."""
 
     parts: Mapping[str, str | None]
     groups: Mapping[str, str]
@@ -84,15 +80,9 @@ class Split:
 
 @dataclass(frozen=True, kw_only=True)
 class GroupedSplit(Split):
-    """Base class of splits that divide groups of clips in a seeded order.
-
-    Args:
-        val: fraction of the groups for validation; 0 leaves validation empty.
-        seed: seed of the order of groups.
-        groups: patterns that group clips.
-        groups_file: column file that groups clips; None for no file.
-        train_fraction: fraction of the training groups that are used; the other groups are left out.
-    """
+    """Base class of splits that divide groups of clips (by patterns or a column file) in a seeded order.
+    `val` is the fraction of the groups for validation, `train_fraction` that of the training groups that are
+    used."""
 
     val: float = 0.05
     seed: int = 0
@@ -137,17 +127,9 @@ class GroupedSplit(Split):
     def _divide_groups(
         self, aliases: Mapping[str, str], fractions: Mapping[str, float]
     ) -> dict[str, str | None]:
-        """Map clips to parts: the first groups in seeded order fill `fractions`' parts, the others train.
-
-        If `train_fraction` is below 1, the last groups of train are left out (None).
-
-        Args:
-            aliases: clip name -> the name for patterns and the seeded order.
-            fractions: part -> its fraction of the groups.
-
-        Raises:
-            InputError: if there are fewer groups than parts.
-        """
+        """Map clips to parts: the first groups in seeded order fill `fractions`' parts, the others train. If
+        `train_fraction` is below 1, the last groups of train are left out (None). `aliases` has clip name ->
+        the name for patterns and order. Raises InputError if there are fewer groups than parts."""
         ranked = sorted(
             self.grouping.group_clips(aliases), key=lambda group: make_sort_key(aliases[group[0]], self.seed)
         )
@@ -169,10 +151,8 @@ def make_sort_key(name: str, seed: int) -> str:
 
 
 def _count_groups(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
-    """Return the number of groups of each part: the rounded fraction, but at least 1 unless it is 0.
-
-    At least one group remains for train.
-    """
+    """Return the number of groups of each part: the rounded fraction, but at least 1 unless it is 0; train
+    has at least one."""
     counts = {
         part: max(1, round(part_fraction * total)) if part_fraction > 0 else 0
         for part, part_fraction in fractions.items()
@@ -240,13 +220,8 @@ class SeededSplit(GroupedSplit):
 
 @dataclass(frozen=True)
 class MixedSplit(Split):
-    """A split of several sources, each of which has its own split and all parts.
-
-    A clip's name is "SOURCE/NAME". The source's split gets only NAME.
-
-    Args:
-        splits: name of a source -> its split.
-    """
+    """A split of several sources, each of which has its own split and all parts. A clip's name is
+    "SOURCE/NAME". The source's split gets only NAME."""
 
     splits: Mapping[str, SeededSplit]
 
@@ -306,16 +281,11 @@ class PublishedSplit(GroupedSplit):
 
 @dataclass(frozen=True)
 class ListSplit(PublishedSplit):
-    """A split by published lists (AvatarPoser, AGRoL): FOLDER/SUBSET/train_split.txt and test_split.txt.
-
-    Each line is the relative path of an npz file. Blank lines, CRLF, a leading `./` and folders above the
-    subset's folder are accepted. An entry matches the clip with this name, or else the corresponding clip of
-    a different AMASS release. Clips without an entry are left out. Group patterns are matched with the
-    entries' names. So a list divides all releases in the same way.
-
-    Args:
-        folder: the folder of the lists.
-    """
+    """A split by published lists (AvatarPoser, AGRoL): FOLDER/SUBSET/train_split.txt and test_split.txt. Each
+    line is the relative path of an npz file. Blank lines, CRLF, a leading `./` and folders above the subset's
+    folder are accepted. An entry matches the clip with this name, or else the corresponding clip of a
+    different AMASS release. Clips without an entry are left out. Group patterns are matched with the entries'
+    names, so a list divides all releases in the same way."""
 
     folder: Path
     entries: Mapping[str, str] = field(init=False, repr=False, compare=False)
@@ -345,14 +315,8 @@ class ListSplit(PublishedSplit):
 
 @dataclass(frozen=True)
 class SubsetSplit(PublishedSplit):
-    """A split by top-level folder. Letter case and the differing subset names of AMASS releases are ignored.
-
-    Clips in other folders are left out.
-
-    Args:
-        train: names of the training subsets.
-        test: names of the test subsets.
-    """
+    """A split by subsets, which are top-level folders. Letter case and the differing subset names of AMASS
+    releases are ignored. Clips in other folders are left out."""
 
     train: Sequence[str]
     test: Sequence[str]

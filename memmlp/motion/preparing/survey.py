@@ -31,14 +31,8 @@ from memmlp.motion.preparing.manifest import STILL, ClipRecord, name_copies
 
 @dataclass(frozen=True)
 class Survey:
-    """The result of reading a folder of npz files.
-
-    Attributes:
-        clips: valid clips; their split and group are still empty.
-        skipped: bad files, including too short clips.
-        short: names of the clips with too few frames.
-        unusual: clip -> its likely mistakes.
-    """
+    """The result of reading a folder: valid clips without split and group, bad files (also too short clips),
+    the names of the too short clips, and clip -> its likely mistakes."""
 
     clips: tuple[ClipRecord, ...]
     skipped: tuple[SkippedFile, ...]
@@ -61,11 +55,8 @@ class TooShortError(InputError):
 
 
 def survey_folder(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
-    """Read every npz file below a folder.
-
-    Raises:
-        InputError: if there are no npz files, or if `strict` is set and a file is bad.
-    """
+    """Read every npz file below a folder. Raises InputError if there is none, or if `strict` is set and a
+    file is bad."""
     clips: dict[str, ClipRecord] = {}
     firsts: dict[str, np.ndarray] = {}
     marks: dict[str, tuple[MarkedFrames, MarkedFrames]] = {}

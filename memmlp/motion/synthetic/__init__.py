@@ -34,13 +34,9 @@ MARGIN = 4.0  # seconds: a clip is a random excerpt of a performance that is lon
 
 
 def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 60.0) -> list[Path]:
-    """Write clips of 8 to 20 s with a total duration of `minutes`, as OUT/ACTIVITY/ACTIVITY_NNN.npz.
-
-    At least three clips are written, which are shorter if necessary. The clips depend only on the arguments.
-
-    Raises:
-        InputError: for invalid arguments.
-    """
+    """Write clips of 8 to 20 s with a total duration of `minutes`, as OUT/ACTIVITY/ACTIVITY_NNN.npz: at least
+    three, which are shorter if necessary. They depend only on the arguments. Raises InputError for invalid
+    arguments."""
     low, high = FRAME_RATE_RANGE
     if not (math.isfinite(minutes) and minutes > 0):
         raise InputError(f"minutes={minutes:g}: must be a positive number")
@@ -64,11 +60,8 @@ def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 
 
 
 def synthesize_clip(activity: str, seed: int, *, seconds: float = 14.0, fps: float = 60.0) -> Clip:
-    """Make one float32 clip of the built-in body, with the name ACTIVITY/SEED.
-
-    Raises:
-        InputError: for an unknown activity.
-    """
+    """Make one float32 clip of the built-in body, with the name ACTIVITY/SEED. Raises InputError for an
+    unknown activity."""
     if activity not in ACTIVITIES:
         raise InputError(f"activity={activity}: must be one of {', '.join(ACTIVITIES)}")
     rng = np.random.default_rng([list(ACTIVITIES).index(activity), seed])

@@ -91,16 +91,9 @@ def draw_reaching(rng: np.random.Generator, t: Array) -> Puppet:
 def _reach_target(
     puppet: Puppet, sides: tuple[int, ...], outward: float, elevation: float, part: float, weight: Array
 ) -> None:
-    """Move hands towards a target; trunk, knees and gaze support the motion.
-
-    Args:
-        puppet: the person, changed in place.
-        sides: the hands, 0 left and 1 right.
-        outward: horizontal angle of the target from straight ahead, radians.
-        elevation: angle of the target above the shoulder, radians.
-        part: distance of the target, in arm lengths.
-        weight: progress of the hands (N,), in [0, 1].
-    """
+    """Move hands (0 left, 1 right) towards a target, in place, supported by trunk, knees and gaze. `outward`
+    is the target's horizontal angle from straight ahead, `elevation` that above the shoulder, radians; `part`
+    its distance in arm lengths; `weight` the progress of the hands (N,), in [0, 1]."""
     turn = sum(LEFT_RIGHT[side] for side in sides)  # a single hand also moves its shoulder
     low, high = max(-elevation, 0.0), max(elevation, 0.0)
     bend_knees(puppet, 0.22 * low**2 * weight)
@@ -167,11 +160,8 @@ def draw_punching(rng: np.random.Generator, t: Array) -> Puppet:
 def _draw_punches(
     rng: np.random.Generator, t: Array, lead: int
 ) -> list[tuple[int, float, float, float, str]]:
-    """Draw combinations of punches with alternating hands.
-
-    Returns:
-        For each punch its side, its times of start, reach and end in seconds, and its kind.
-    """
+    """Draw combinations of punches with alternating hands: side, start, reach and end in seconds,
+    and kind."""
     blows = []
     for start, end in draw_occasions(rng, t, (0.7, 2.2), (0.3, 1.5)):
         side, now = lead if rng.random() < 0.7 else 1 - lead, start
@@ -211,17 +201,8 @@ def draw_jumping(rng: np.random.Generator, t: Array) -> Puppet:
 def _perform_jump(
     puppet: Puppet, t: Array, swing: float, start: float, off: float, on: float, depth: float
 ) -> None:
-    """Move pelvis, trunk and arms through one jump.
-
-    Args:
-        puppet: the person, changed in place.
-        t: times (N,), seconds.
-        swing: factor on the swing of the arms.
-        start: start of the crouch, seconds.
-        off: take-off, seconds.
-        on: landing, seconds.
-        depth: depth of the crouch, metres.
-    """
+    """Move pelvis, trunk and arms through one jump, in place. `swing` is a factor on the swing of the arms;
+    `start` (of the crouch), `off` and `on` (landing) are seconds; `depth` is that of the crouch, metres."""
     low, deep, end, speed = off - 0.28, on + 0.22, on + 0.9, GRAVITY * (on - off) / 2
     heights, speeds = [0, -depth, -0.04, -0.08, -0.7 * depth, 0], [0, 0, speed, -speed, 0, 0]
     inside = (t > start) & (t < end)

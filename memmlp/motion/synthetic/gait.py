@@ -106,17 +106,10 @@ class Footwork:
         first: int = 0,
         **step: Any,
     ) -> None:
-        """Move both feet to a new stance, one foot after the other.
-
-        Args:
-            off: time at which the first foot leaves the floor, seconds.
-            duration: time that each foot is in the air, seconds.
-            delay: delay of the second foot, seconds.
-            shift: translation of the stance's centre (2,), metres, world.
-            turn: change of the stance's heading, radians.
-            first: the first foot, 0 left, 1 right.
-            step: further attributes of FootStep.
-        """
+        """Move both feet to a new stance, one after the other. The first foot (0 left, 1 right) leaves the
+        floor at `off`, is in the air for `duration`, and the second follows after `delay`, all in seconds.
+        `shift` is the translation of the stance's centre (2,), metres, world, `turn` the change of its
+        heading, radians; `step` has further attributes of FootStep."""
         s = self.stance = replace(
             self.stance, center=self.stance.center + shift, heading=self.stance.heading + turn
         )
@@ -160,14 +153,8 @@ def stand(rng: np.random.Generator, t: Array, style: Style, work: Footwork | Non
 def draw_occasions(
     rng: np.random.Generator, t: Array, length: tuple[float, float], pause: tuple[float, float]
 ) -> Iterator[tuple[float, float]]:
-    """Draw successive events with pauses, and yield the start and end of each event, seconds.
-
-    Args:
-        rng: random generator.
-        t: times (N,), seconds.
-        length: range of the duration of an event, seconds.
-        pause: range of the duration of a pause, seconds.
-    """
+    """Draw successive events with pauses at the times t (N,), and yield their start and end. The ranges of
+    their lengths and pauses are in seconds."""
     start = t[0] + rng.uniform(0.0, max(pause))
     while (end := start + rng.uniform(*length)) < t[-1]:
         yield start, end
@@ -296,7 +283,6 @@ def _draw_feet(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
 
 
 def _make_step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike: float) -> FootStep:
-    """Make the step that ends at phase `strike`. At a low pace, steps are small and flat."""
     off, on, over = np.interp(
         [strike - 1 + gait.duty, strike, strike + gait.ahead * gait.duty], course.phase, t
     )

@@ -93,10 +93,8 @@ def smooth_below(x: Array, frames: int) -> Array:
 
 
 def compute_soft_minimum(a: Array, b: Array, width: float) -> Array:
-    """Return a smooth curve below both `a` and `b`.
-
-    The distance to their minimum is at most `width` / 2, and smaller if `a` and `b` differ more.
-    """
+    """Return a smooth curve below both `a` and `b`. The distance to their minimum is at most `width` / 2, and
+    smaller if `a` and `b` differ more."""
     return 0.5 * (a + b - np.sqrt((a - b) ** 2 + width**2))
 
 
@@ -131,14 +129,8 @@ class Feet:
 
 
 def apply_foot_steps(t: Array, places: Array, yaws: Array, steps: Iterable[FootStep]) -> Feet:
-    """Return the motion of both feet for a sequence of steps.
-
-    Args:
-        t: times (N,), seconds.
-        places: start positions of the feet (2, 2), metres, world.
-        yaws: start directions of the feet (2,), radians, world.
-        steps: the steps, sorted by time.
-    """
+    """Return the motion of both feet at the times t (N,) for steps sorted by time, from start positions (2,
+    2), metres, and directions (2,), radians, in the world."""
     n = len(t)
     ground = np.zeros((n, 2, 3))
     ground[:, :, :2] = places
@@ -214,17 +206,10 @@ def solve_two_bones(
     rest_pole: Array,
     free: Array | float,
 ) -> tuple[Rotation, Rotation]:
-    """Return the global rotations (N) of two bones that lead from `start` to `target`.
-
-    Args:
-        start: start positions (N, 3).
-        target: target positions (N, 3); the bones approach an unreachable target as far as possible.
-        pole: directions (N, 3) to which the joint between the bones points.
-        bones: the two bones (3,) in the rest pose.
-        rest_pole: direction (3,) to which the joint between the bones points in the rest pose.
-        free: how early a stretching limb slows down (N,), in [0, 1]. With 0 the limb reaches targets exactly,
-            up to nearly its full length.
-    """
+    """Return the global rotations (N) of two bones from `start` (N, 3) to `target` (N, 3), or as near as
+    possible. The joint between them points to `pole` (N, 3), in the rest pose, where the bones are (3,), to
+    `rest_pole` (3,). `free` (N,), in [0, 1], is how early a stretching limb slows down; with 0 it reaches
+    targets exactly, up to nearly its full length."""
     upper, lower = bones
     a, b = float(np.linalg.norm(upper)), float(np.linalg.norm(lower))
     span = np.linalg.norm(target - start, axis=-1, keepdims=True)
@@ -270,10 +255,8 @@ def _compute_root(puppet: Puppet, pelvis: Rotation) -> Array:
 
 
 def _solve_leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, Rotation]:
-    """Return the local rotations of a leg's hip, knee, ankle and foot.
-
-    The knee points in the mean direction of pelvis and foot.
-    """
+    """Return the local rotations of a leg's hip, knee, ankle and foot. The knee points in the mean direction
+    of pelvis and foot."""
     name, sign = SIDES[side]
     ankle, foot = compute_ankle(puppet.feet, side)
     frames = round(puppet.settle * puppet.fps) // 2
@@ -326,11 +309,9 @@ def _extend_flags(flags: Array, frames: int) -> Array:
 
 
 def _limit_reach(span: Array, full: float, free: Array | float) -> Array:
-    """Limit a limb's reach (N, 1), so the limb is never completely straight.
-
-    A short reach stays unchanged. Above about STRETCH of the full length, the reach smoothly approaches 99.9
-    % of the full length. With a larger `free`, the limit begins earlier.
-    """
+    """Limit a limb's reach (N, 1), so the limb is never completely straight. Above about STRETCH of the full
+    length, the reach smoothly approaches 99.9 % of the full length. With a larger `free`, the limit begins
+    earlier."""
     start = (STRETCH - 0.05 * np.reshape(free, (-1, 1))) * full
     margin = 0.999 * full - start
     return np.where(span < start, span, start + margin * np.tanh((span - start) / margin))

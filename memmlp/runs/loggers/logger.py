@@ -1,8 +1,7 @@
 """Shows runs in loggers while they are in progress, by threads that read the runs' folders.
 
 The metrics log on disk is the queue between a run and its loggers. So the run never waits for a logger, and
-no data is lost if a logger is slow or fails. `memmlp loggers sync` adds missing data later.
-"""
+no data is lost if a logger is slow or fails. `memmlp loggers sync` adds missing data later."""
 
 from __future__ import annotations
 
@@ -31,14 +30,7 @@ ORIGIN = ("kind", "data", "prerequisite", "started", "version", "user", "host", 
 
 
 class CurvePoint(NamedTuple):
-    """A point of a curve.
-
-    Attributes:
-        key: the curve's name, PHASE/NAME.
-        value: the value, possibly NaN.
-        step: the training step.
-        time: seconds since 1970, UTC.
-    """
+    """A point of the curve `key` (PHASE/NAME); `time` is seconds since 1970, UTC."""
 
     key: str
     value: float
@@ -48,25 +40,10 @@ class CurvePoint(NamedTuple):
 
 @dataclass(frozen=True)
 class RunFacts:
-    """All facts about a run that loggers show, without its curves.
-
-    Attributes:
-        id: the run's id.
-        name: the run's readable name.
-        folder: the run's folder.
-        status: "running", "done", "failed" or "killed".
-        reason: the reason why it failed; None if it has not failed.
-        started, ended: seconds since 1970; `ended` is None while it runs.
-        config: the run's config by dotted key, as text.
-        origin: facts about its origin, by name.
-        tags: the run's tags.
-        note: the run's note; may be empty.
-        data: name and digest of its data.
-        results: its results, as points at the last training step.
-        outdated: the modes with outdated results and their changed component versions; empty if current.
-        files: the files to upload.
-        fingerprint: a digest of everything that loggers show, including curves.
-    """
+    """All facts about a run that loggers show, without its curves. `status` is "running", "done", "failed" or
+    "killed"; times are seconds since 1970; `ended` is None while it runs. `config` and `origin` are texts by
+    key. `results` are points at the last training step. `outdated` names modes with changed component
+    versions. `fingerprint` is a digest of everything that loggers show, including curves."""
 
     id: str
     name: str
@@ -93,12 +70,7 @@ class RunFacts:
 
 
 def read_run_facts(run: Run, running: bool = False) -> RunFacts:
-    """Read the facts of a run that has started.
-
-    Args:
-        run: the run.
-        running: whether the run is in progress; otherwise its final state is read.
-    """
+    """Read the facts of a run that has started; its final state unless it is `running`."""
     run.check_records()
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     failure, finished = records.read(run.folder / "FAILED", records.Failure), manifest.get("finished")
@@ -144,11 +116,8 @@ def read_run_facts(run: Run, running: bool = False) -> RunFacts:
 
 
 class LogReader:
-    """Reads a run's metrics log: first all existing lines, then only new lines.
-
-    Attributes:
-        repeated: whether a step was logged again, because the run was resumed.
-    """
+    """Reads a run's metrics log: first all existing lines, then only new lines. `repeated` is set once a step
+    was logged again, because the run was resumed."""
 
     def __init__(self, run: Run):
         self.log, self.offset, self.repeated = MetricsLog(run.metrics_path), 0, False
@@ -197,11 +166,7 @@ class ShownRun(Protocol):
 
 
 class RunLogger(Protocol):
-    """The interface of loggers. Every method may block and may raise.
-
-    Attributes:
-        name: the option's name.
-    """
+    """The interface of loggers; `name` is the option's name. Every method may block and may raise."""
 
     name: str
 
@@ -271,23 +236,13 @@ class Session:
 
 @dataclass(frozen=True)
 class Loggers:
-    """The loggers that show the runs of an experiment.
-
-    Attributes:
-        loggers: the loggers.
-        outputs: the outputs folder.
-    """
-
     loggers: tuple[RunLogger, ...]
     outputs: Path
 
     @contextlib.contextmanager
     def show_run(self, run: Run) -> Iterator[None]:
-        """Show a run during the context, then its final state.
-
-        A logger never stops the run. If a logger fails, a warning goes to stderr. If it is slow, the run
-        waits at its end for at most MAX_WAIT.
-        """
+        """Show a run during the context, then its final state. A logger never stops the run: if it fails, a
+        warning goes to stderr; if it is slow, the run waits at its end for at most MAX_WAIT."""
         ended = threading.Event()
         threads = self._start_threads(
             lambda logger: _show_until_end(Session(logger, run), ended), f"run {run.id}"
@@ -308,7 +263,6 @@ class Loggers:
 
 
 def _wait_for_threads(threads: Sequence[threading.Thread]) -> None:
-    """Wait for threads for at most MAX_WAIT, and print a warning about each unfinished thread."""
     end = time.monotonic() + MAX_WAIT
     for thread in threads:
         thread.join(max(end - time.monotonic(), 0))
@@ -349,17 +303,9 @@ def _format_error(error: BaseException) -> str:
 def sync_runs(
     logger: RunLogger, runs: Iterable[Run], report: Callable[[str], None], full: bool = False
 ) -> Counter[str]:
-    """Update a logger with the content of each run's folder; runs in progress are skipped.
-
-    Args:
-        logger: the logger.
-        runs: the runs.
-        report: gets a line about each failure.
-        full: whether runs that are up to date are sent again.
-
-    Returns:
-        The number of runs that were "shown", up to date ("same"), in progress ("live") and "failed".
-    """
+    """Update a logger with the content of each run's folder; `report` gets a line about each failure. With
+    `full`, runs that are up to date are sent again. Return how many runs were "shown", up to date ("same"),
+    in progress ("live", skipped) and "failed"."""
     counts: Counter[str] = Counter()
     for run in runs:
         try:

@@ -49,15 +49,8 @@ class MLflowSettings(Settings):
 
 @dataclass(frozen=True)
 class MLflow:
-    """Shows runs in MLflow; all output of MLflow's packages is suppressed.
-
-    Attributes:
-        uri: the tracking store; None for MLFLOW_TRACKING_URI, or a sqlite file in the outputs folder.
-        outputs: the outputs folder.
-
-    Raises:
-        InputError: if MLflow is not installed.
-    """
+    """Shows runs in MLflow at the store `uri`; None for MLFLOW_TRACKING_URI, or a sqlite file in the outputs
+    folder. All output of MLflow's packages is suppressed. Raises InputError if MLflow is not installed."""
 
     uri: str | None
     outputs: Path
@@ -129,13 +122,6 @@ class MLflow:
 
 @dataclass(frozen=True)
 class ShownInMLflow:
-    """A run in MLflow.
-
-    Attributes:
-        logger: the logger.
-        mlflow_id: the run's id in MLflow.
-    """
-
     logger: MLflow
     mlflow_id: str
 

@@ -28,14 +28,8 @@ class TensorBoardSettings(Settings):
 
 @dataclass(frozen=True)
 class TensorBoard:
-    """Writes each run as a folder of event files in outputs/tensorboard.
-
-    Attributes:
-        outputs: the outputs folder.
-
-    Raises:
-        InputError: if tensorboardX is not installed.
-    """
+    """Writes each run as a folder of event files in outputs/tensorboard. Raises InputError without
+    tensorboardX."""
 
     outputs: Path
 

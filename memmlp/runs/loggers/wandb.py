@@ -34,15 +34,8 @@ class WandBSettings(Settings):
 
 @dataclass(frozen=True)
 class WandB:
-    """Writes runs as W&B offline runs to outputs/wandb.
-
-    Attributes:
-        project: the W&B project for uploads with `wandb sync`.
-        outputs: the outputs folder.
-
-    Raises:
-        InputError: if wandb is not installed.
-    """
+    """Writes runs as W&B offline runs to outputs/wandb; `wandb sync` uploads them to the W&B project
+    `project`. Raises InputError if wandb is not installed."""
 
     project: str
     outputs: Path

@@ -41,11 +41,8 @@ class AGRoLLossSettings(CompleteLossSettings):
 
 
 class AGRoLLoss(Loss):
-    """AGRoL's error of the 6D rotations in network space.
-
-    The released code trains both networks with the error "norm". "square" is a possible reading of the paper
-    (Du et al. 2023, L2).
-    """
+    """AGRoL's error of the 6D rotations in network space. The released code trains both networks with "norm";
+    "square" is a possible reading of the paper (Du et al. 2023, L2)."""
 
     def __init__(self, settings: AGRoLLossSettings | None = None):
         super().__init__()
@@ -73,11 +70,9 @@ class AvatarPoserLossSettings(CompleteLossSettings):
 
 
 class AvatarPoserLoss(Loss):
-    """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
-
-    The positions come from forward kinematics. The mean is over the 22 joints; the authors' mean also
-    includes the fingers, which move with the wrists.
-    """
+    """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022). The
+    positions come from forward kinematics. The mean is over the 22 joints; the authors' also includes the
+    fingers."""
 
     def __init__(self, settings: AvatarPoserLossSettings | None = None):
         super().__init__()
@@ -122,10 +117,8 @@ class RPMLossSettings(CompleteLossSettings):
 
 class RPMLoss(Loss):
     """RPM's L1 norms of joint errors: rotations, positions and their velocities (CVPR 2025, released code).
-
-    Rotations are compared in network space, which may have z-scores. Positions are in world metres, from
-    forward kinematics with the head on its tracker.
-    """
+    Rotations are in network space. Positions are in world metres, by forward kinematics with the head on its
+    tracker."""
 
     def __init__(self, settings: RPMLossSettings | None = None):
         super().__init__()

@@ -74,13 +74,8 @@ class FixedWeights(nn.Module):
         self.values = values
 
     def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
-        """Add the weights of custom terms, and check that every term has a weight.
-
-        A custom term may reuse the name of an unused weight. Its own weight then replaces the unused weight.
-
-        Raises:
-            InputError: if a term does not have a weight.
-        """
+        """Add the weights of custom terms. A custom term may reuse the name of an unused weight, and then
+        replaces it. Raises InputError if a term does not have a weight."""
         self.values = {**self.values, **(own or {})}
         if lacking := [name for name in names if name not in self.values]:
             raise InputError(f"loss.{lacking[0]}: must have a weight, like {', '.join(self.values)}")
@@ -106,18 +101,11 @@ class ManualWeights(FixedWeights):
 
 
 class UncertaintyWeights(nn.Module):
-    """Weights by homoscedastic uncertainty: e^-s L + s, with one s per term (Kendall et al. 2018).
-
-    A term of exactly 0, such as penetration of feet above the floor, leaves its s unchanged. Otherwise e^-s
-    would grow without bound. See docs/readings.md, no. 8.
-
-    Args:
-        lr: learning rate of every s; the model's learning rate would be too low.
-        values: initial weights by the terms' names; `build` resets all weights to 1.
-
-    Raises:
-        InputError: if a weight is 0, because e^-s is never 0.
-    """
+    """Weights by homoscedastic uncertainty: e^-s L + s, with one s per term (Kendall et al. 2018). A term of
+    exactly 0, such as penetration of feet above the floor, leaves its s unchanged; otherwise e^-s would grow
+    without bound (docs/readings.md, no. 8). `lr` is the learning rate of every s; the model's would be too
+    low. `values` are initial weights by term; `build` resets all weights to 1. Raises InputError if a weight
+    is 0."""
 
     def __init__(self, lr: float = 1e-2, values: Mapping[str, float] | None = None):
         super().__init__()
@@ -155,23 +143,15 @@ class Loss(nn.Module):
     weighting: Weighting
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the loss terms by name.
-
-        Args:
-            motion: predicted motion (B, T, 198), world.
-            truth: true motion (B, T, 198), world.
-            sparse: inputs (B, T, 54), world.
-            normalizer: converts between the world and network space.
-        """
+        """Return the loss terms by name, for motion and truth (B, T, 198) and inputs (B, T, 54), all in the
+        world."""
         raise NotImplementedError
 
     def forward(
         self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
     ) -> tuple[Tensor, Terms]:
-        """Return the loss and its unweighted terms; the arguments are those of `terms`.
-
-        The loss is computed in float32, because velocities and jerk are small differences.
-        """
+        """Return the loss and its unweighted terms; the arguments are those of `terms`. It is computed in
+        float32, because velocities and jerk are small differences."""
         with use_float32(truth.device):
             terms = self.terms(motion.to(truth.dtype), truth, sparse, normalizer)
             return self.weighting(terms), terms

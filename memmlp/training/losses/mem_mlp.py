@@ -2,8 +2,7 @@
 
 The paper's terms are implemented as printed: L1, summed over joints and components, averaged over time and
 batch (docs/readings.md, no. 10). All values are in world coordinates: rotations in 6D components, positions
-in metres, velocities per frame.
-"""
+in metres, velocities per frame."""
 
 from __future__ import annotations
 
@@ -35,7 +34,6 @@ class NoHandTerm:
     branch = "position"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return an empty dict."""
         return {}
 
 
@@ -57,17 +55,14 @@ class PositionHandTerm:
     branch = "position"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the hand term for motion and truth (B, T, 198)."""
         hands = list(HANDS)
         return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
 
 
 @component("hand", "fk")
 class KinematicHandTerm:
-    """The hand term: L1 of both wrists' positions from the rotation branch, by forward kinematics.
-
-    The predicted head is placed on its tracker.
-    """
+    """The hand term: L1 of both wrists' positions from the rotation branch, by forward kinematics with the
+    head on its tracker."""
 
     branch = "rotation"
 
@@ -83,15 +78,9 @@ Hand = NoHandTerm | PositionHandTerm | KinematicHandTerm
 
 
 class Term:
-    """The interface of the slot `term`: a custom loss term. This base class does not add a term.
-
-    Args:
-        weight: the term's weight with fixed weights (`loss=manual`); uncertainty weighting learns its own
-            weight.
-
-    Attributes:
-        branch: the branch that the term compares; a network without this branch does not have the term.
-    """
+    """The interface of the slot `term`: a custom loss term with a `weight` for fixed weights (`loss=manual`).
+    A network without the `branch` that the term compares does not have the term. This base class does not add
+    a term."""
 
     branch = "position"
 
@@ -104,17 +93,8 @@ class Term:
 
 
 class MotionLoss(Loss):
-    """Mem-MLP's loss (Eq. 5), with the terms for the predictor's branches.
-
-    Args:
-        weighting: ManualWeights or UncertaintyWeights.
-        hand: the hand term.
-        branches: the predictor's branches.
-        term: an additional custom term.
-
-    Raises:
-        InputError: if two terms have the same name, or a term does not have a weight.
-    """
+    """Mem-MLP's loss (Eq. 5), with the terms for the predictor's branches, a hand term and an additional
+    custom term. Raises InputError if two terms have the same name, or a term does not have a weight."""
 
     def __init__(self, weighting: Weighting, hand: Hand, branches: frozenset[str], term: Term | None = None):
         super().__init__()
@@ -137,7 +117,6 @@ class MotionLoss(Loss):
     def _compute_custom_term(
         self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
     ) -> Terms:
-        """Return the custom term, if the network has the branch that it compares."""
         given = self.term.branch in self.branches
         return self.term(motion, truth, sparse, normalizer) if given else {}
 

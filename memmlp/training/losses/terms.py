@@ -1,8 +1,5 @@
-"""A library of loss terms for any network (`TermsLoss`).
-
-All terms compare a predicted body with the true body in the world. Positions are in metres, velocities in
-metres per frame.
-"""
+"""A library of loss terms for any network (`TermsLoss`). All terms compare a predicted body with the true
+body in the world. Positions are in metres, velocities in metres per frame."""
 
 from __future__ import annotations
 
@@ -37,12 +34,8 @@ MAX_STANDING_MOVE = 0.01  # metres a frame, up to which a true foot stands
 
 
 class BodyMotion:
-    """A body's pose at each frame, with cached values that several terms need.
-
-    Args:
-        motion: world motion (B, T, 198); only its rotations are used.
-        normalizer: provides the rest pose.
-    """
+    """A body's pose at each frame of world motion (B, T, 198), of which only rotations are used, with cached
+    values that several terms need. `normalizer` provides the rest pose."""
 
     def __init__(self, motion: Tensor, normalizer: Normalizer):
         self.rest = normalizer.rest
@@ -76,20 +69,9 @@ ERRORS: dict[str, Error] = {
 
 
 class Comparison:
-    """A predicted motion compared with the true motion.
-
-    Each weight of TermsLossSettings has a method with the same name, which returns the term.
-
-    Args:
-        motion: predicted world motion (B, T, 198).
-        truth: true world motion (B, T, 198).
-        sparse: world inputs (B, T, 54).
-        normalizer: provides the rest pose.
-
-    Attributes:
-        positions: predicted joints (B, T, 22, 3), with the head on its tracker.
-        true_positions: true joints (B, T, 22, 3).
-    """
+    """A predicted motion compared with the true motion, both in the world (B, T, 198), with inputs (B, T,
+    54). Each weight of TermsLossSettings has a method with the same name, which returns the term. Positions
+    are joints (B, T, 22, 3); the predicted ones have the head on its tracker."""
 
     def __init__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer):
         self.predicted, self.truth = BodyMotion(motion, normalizer), BodyMotion(truth, normalizer)
@@ -254,15 +236,9 @@ TERMS = tuple(one.name for one in fields(TermsLossSettings) if one.type == "floa
 
 
 class TermsLoss(Loss):
-    """A weighted sum of the library's terms, used by most baselines.
-
-    Args:
-        error, weighting, lr: see TermsLossSettings.
-        weights: weights by the names of TERMS; None leaves a term out.
-
-    Raises:
-        InputError: if no term has a weight, or a learned weight would begin at 0.
-    """
+    """A weighted sum of the library's terms, used by most baselines; see TermsLossSettings for the arguments.
+    None as the weight leaves a term out. Raises InputError if no term has a weight, or a learned weight would
+    begin at 0."""
 
     def __init__(
         self, error: str = "absolute", weighting: str = "fixed", lr: float = 1e-2, **weights: float | None
