@@ -83,8 +83,8 @@ def make_key(text: str, allowed: str, max_length: int) -> str:
 
 
 def escape_latex(text: str) -> str:
-    """Return a text for LaTeX, also at the start of a table's row, where [ and * belong to \\ and \midrule.
-    Ligatures are prevented. Line breaks become blanks."""
+    """Return a text for LaTeX, also at the start of a table's row, where [ and * belong to the command
+    before them. Ligatures are prevented. Line breaks become blanks."""
     text = re.sub(r"([-',!?])(?=[-'`,])", "\\1\0", " ".join(text.split()))
     escaped = "".join(TEX_ESCAPES.get(letter, letter) for letter in text).replace("\0", "{}")
     return f"{{}}{escaped}" if escaped.startswith(("[", "*", "(")) else escaped

@@ -10,6 +10,7 @@ import json
 import os
 import re
 import stat
+import types
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
@@ -38,178 +39,68 @@ Errors = dict[str, Number | None]
 Word = str | int | None
 
 
-class Attempt(TypedDict, total=False):
-    """The begin of a process' work on a run."""
-
-    started: Time
-    step: int
-    stage: str
+def _record(*bases: Any, **fields: Any) -> Any:
+    """Make a TypedDict with these fields, which may be missing, and the fields of its bases."""
+    return _make_typed_dict(bases, fields, total=False)
 
 
-class Commit(TypedDict):
-    """The commit of the code."""
-
-    commit: str
-    dirty: bool
+def _complete_record(*bases: Any, **fields: Any) -> Any:
+    return _make_typed_dict(bases, fields, total=True)
 
 
-class EarlierCommit(Commit, total=False):
-    """The commit of the code, and of the code before the run was resumed."""
-
-    before: str
-
-
-class Plugin(TypedDict):
-    """Version and code digest of a custom package."""
-
-    version: str | None
-    digest: str
+def _make_typed_dict(bases: tuple[Any, ...], fields: dict[str, Any], total: bool) -> Any:
+    content = {"__annotations__": fields, "__module__": __name__}
+    return types.new_class("Record", bases or (TypedDict,), {"total": total}, lambda own: own.update(content))
 
 
-class Origin(TypedDict, total=False):
-    """Code and machine."""
+# Code and machine
+Commit = _complete_record(commit=str, dirty=bool)
+EarlierCommit = _record(Commit, before=str)  # `before` the run was resumed
+Plugin = _complete_record(version=str | None, digest=str)
+Origin = _record(
+    version=str, git=EarlierCommit | None, packages=dict[str, str | None] | None,
+    component_versions=dict[str, int] | None, sources=dict[str, str] | None,
+    plugins=dict[str, Plugin] | None,
+    **dict.fromkeys(("cpu", "device", "gpu", "gpu_index", "threads", "processes", "precision"), Word),
+)  # fmt: skip
 
-    version: str
-    git: EarlierCommit | None
-    packages: dict[str, str | None] | None
-    cpu: Word
-    component_versions: dict[str, int] | None
-    sources: dict[str, str] | None
-    plugins: dict[str, Plugin] | None
-    device: Word
-    gpu: Word
-    gpu_index: Word
-    threads: Word
-    processes: Word
-    precision: Word
+# manifest.json, DONE, FAILED and notes.json
+Attempt = _record(started=Time, step=int, stage=str)
+PrerequisiteRun = _record(Origin, id=Name, kind=str, weights=str | None)
+Manifest = _record(
+    Origin, id=str, kind=str, name=str, user=str | None, data=str, body=str,
+    prerequisite=Name | None,
+    prerequisite_runs=list[PrerequisiteRun] | None,  # type: ignore[valid-type]
+    prerequisite_tflop=float | None, started=Time, finished=Time | None,
+    attempts=list[Attempt],  # type: ignore[valid-type]
+    seconds=dict[str, float] | None, forgiven=int, stages=list[Name],
+    steps=int | None, best_step=int | None, tflop=float | None, source_bytes=dict[str, str],
+    **dict.fromkeys(("partial", "divided", "resampled", "unusual"), str | None),
+)  # fmt: skip
+Marker = _record(id=str, finished=Time, artifacts=dict[Name, str])
+Failure = _record(reason=str, when=Time, details=str)
+Notes = _record(tags=list[str], note=str)
 
-
-class PrerequisiteRun(Origin, total=False):
-    """The origin of a prerequisite run."""
-
-    id: Name
-    kind: str
-    weights: str | None
-
-
-class Manifest(Origin, total=False):
-    """manifest.json: facts about a run."""
-
-    id: str
-    kind: str
-    name: str
-    user: str | None
-    data: str
-    body: str
-    prerequisite: Name | None
-    prerequisite_runs: list[PrerequisiteRun] | None
-    prerequisite_tflop: float | None
-    started: Time
-    finished: Time | None
-    seconds: dict[str, float] | None
-    attempts: list[Attempt]
-    forgiven: int
-    stages: list[Name]
-    steps: int | None
-    best_step: int | None
-    tflop: float | None
-    source_bytes: dict[str, str]
-    partial: str | None
-    divided: str | None
-    resampled: str | None
-    unusual: str | None
-
-
-class Marker(TypedDict, total=False):
-    """DONE: the digests of the files of a finished training."""
-
-    id: str
-    finished: Time
-    artifacts: dict[Name, str]
-
-
-class Failure(TypedDict, total=False):
-    """FAILED: the reason of a failure."""
-
-    reason: str
-    when: Time
-    details: str
-
-
-class Notes(TypedDict, total=False):
-    """notes.json: tags and note of a run."""
-
-    tags: list[str]
-    note: str
-
-
-class Component(TypedDict, total=False):
-    """A config group of a component, with the keys that are read without the component."""
-
-    name: str
-    frames: int | None
-    steps: int | None
-    batch: int | None
-    tflop: float | None
-
-
-class Data(TypedDict, total=False):
-    """The config group `data`."""
-
-    name: str
-    split: dict[str, Any] | None
-    sources: dict[str, dict[str, Any]] | None
-    synth: dict[str, Any] | None
-
-
-class Evaluating(TypedDict, total=False):
-    """The config group `evaluation`."""
-
-    ik: str | bool | None
-    modes: list[str]
-    metrics: list[str] | None
-
-
+# config.yaml: the keys of its groups that are read without the components
 Group = dict[str, Any] | None
-CONFIG: Any = {
-    "plugins": list[str] | None,
-    "data": Data | None,
-    "vqvae": Component | None,
-    "evaluation": Evaluating,
-    "loggers": dict[str, Group] | None,
-    **dict.fromkeys(("paths", "profile"), Group),
-    **dict.fromkeys(("normalizer", "export"), dict[str, Any]),
-    **dict.fromkeys(SLOTS, Component | None),
+Component = _record(name=str, frames=int | None, steps=int | None, batch=int | None, tflop=float | None)
+Data = _record(name=str, split=Group, sources=dict[str, dict[str, Any]] | None, synth=Group)
+Evaluating = _record(ik=str | bool | None, modes=list[str], metrics=list[str] | None)
+CONFIG = {
+    "plugins": list[str] | None, "data": Data | None, "vqvae": Component | None, "evaluation": Evaluating,
+    "loggers": dict[str, Group] | None, **dict.fromkeys(("paths", "profile"), Group),
+    **dict.fromkeys(("normalizer", "export"), dict[str, Any]), **dict.fromkeys(SLOTS, Component | None),
     "optim": Component,
-}
-Config = TypedDict("Config", CONFIG, total=False)  # type: ignore[misc]
-"""config.yaml: the groups of a resolved config."""
+}  # fmt: skip
+Config = _record(**CONFIG)
 
-
-class Settings(TypedDict, total=False):
-    """The settings of an evaluation or a deployment."""
-
-    mode: str
-    ik: str | None
-    ik_iterations: int | None
-    metrics: dict[str, Any] | None
-    graph: str
-    precision: str
-    opset: int
-
-
-class Clip(TypedDict, total=False):
-    """The errors on a test clip; all other fields are branches."""
-
-    group: str | None
-    source: str | None
-    frames: int | None
-
-
-class NamedClip(Clip):
-    """The errors on a test clip with its name."""
-
-    name: str
+# evaluations/ID.json and deployments/ID/latency.json
+Settings = _record(
+    mode=str, ik=str | None, ik_iterations=int | None, metrics=Group, graph=str, precision=str,
+    opset=int,
+)  # fmt: skip
+Clip = _record(group=str | None, source=str | None, frames=int | None)  # other keys are branches
+NamedClip = _complete_record(Clip, name=str)
 
 
 def _has_branches(clip: Mapping[str, Any]) -> bool:
@@ -219,58 +110,25 @@ def _has_branches(clip: Mapping[str, Any]) -> bool:
     return True
 
 
-class Results(TypedDict):
-    """The results of an evaluation: means, and a row for each clip."""
-
-    mode: str
-    mean: dict[str, Errors]
-    clips: list[Annotated[dict[str, Any], _has_branches]]
-
-
-class Evaluation(Results, Origin, total=False):
-    """evaluations/ID.json: an evaluation."""
-
-    run: str
-    name: str
-    settings: Settings | None
-    made: str
-    made_by: Origin
-    digest: str
-    offline: bool
-
-
+Results = _complete_record(
+    mode=str, mean=dict[str, Errors],
+    clips=list[Annotated[dict[str, Any], _has_branches]],
+)  # fmt: skip
+Evaluation = _record(
+    Results, Origin, run=str, name=str, settings=Settings | None, made=str, made_by=Origin,
+    digest=str, offline=bool,
+)  # fmt: skip
 COSTS = (
     "median_ms", "p95_ms", "alone_median_ms", "pose_median_ms", "ratio_to_yardstick", "core_share",
     "alone_core_share", "pose_core_share", "flops", "macs", "parameters", "onnx_bytes",
     "growth", "jitter_growth", "onnx_parity",
 )  # fmt: skip
-Costs = TypedDict("Costs", dict.fromkeys(COSTS, Number), total=False)  # type: ignore[misc]
-"""The costs of an exported file."""
-
-
-class Deployment(Costs, total=False):
-    """deployments/ID/latency.json: measurements of a deployment."""
-
-    run: str
-    settings: Settings
-    made: str
-    made_by: Origin
-    artifacts: dict[Name, str]
-    graph: str
-    int8: Costs
-    int8_blocks: Costs
-    fp16: Costs
-
-
-class LogEntry(TypedDict):
-    """A line of metrics.jsonl."""
-
-    step: int
-    phase: str
-    values: dict[str, Number]
-    time: float
-
-
+Costs = _record(**dict.fromkeys(COSTS, Number))
+Deployment = _record(
+    Costs, run=str, settings=Settings, made=str, made_by=Origin, artifacts=dict[Name, str],
+    graph=str, int8=Costs, int8_blocks=Costs, fp16=Costs,
+)  # fmt: skip
+LogEntry = _complete_record(step=int, phase=str, values=dict[str, Number], time=float)
 Tree = dict[str, Any]  # results.json
 
 
@@ -336,7 +194,7 @@ def compute_digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def parse_log_entry(line: bytes) -> LogEntry:
+def parse_log_entry(line: bytes) -> dict[str, Any]:
     """Parse a line of a metrics log. Raises ValueError if it is not valid."""
     entry = parse_json(line)
     check_type(entry, LogEntry)
