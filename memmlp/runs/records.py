@@ -60,7 +60,7 @@ Plugin = _complete_record(version=str | None, digest=str)
 Origin = _record(
     version=str, git=EarlierCommit | None, packages=dict[str, str | None] | None,
     component_versions=dict[str, int] | None, sources=dict[str, str] | None,
-    plugins=dict[str, Plugin] | None,
+    plugins=dict[str, Plugin] | None,  # type: ignore[valid-type]
     **dict.fromkeys(("cpu", "device", "gpu", "gpu_index", "threads", "processes", "precision"), Word),
 )  # fmt: skip
 
