@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from memmlp.live.tracker_input import SampleWarning
     from memmlp.live.wearer import Offsets
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "InputError",

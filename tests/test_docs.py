@@ -26,6 +26,7 @@ from memmlp.config.compose import compose_config, compose_jobs, compose_plain, p
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.plugins import activate
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
+from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 from memmlp.sweep.search.search_file import parse_search
 from memmlp.sweep.sweep_file import load_sweep
@@ -210,6 +211,10 @@ BOTH_SOURCES = (
 """Sweeps and configs with data of both importers."""
 
 
+EXTENSIONS = {"plugins=[mine]": 0, "plugins=[tilt]": 2, "plugins=[sway]": 4}
+"""Plugins that `docs/guides/components.md` writes, and their places among its blocks of Python."""
+
+
 def create_placeholders(words: list[str]) -> None:
     """Create the data folders and files that overrides name, and the files of the guides."""
     for word in words:
@@ -222,11 +227,14 @@ def create_placeholders(words: list[str]) -> None:
             Path(value).touch()
         elif word in BOTH_SOURCES:
             create_placeholders(["data.root=outputs/data/cmu,outputs/data/bandai"])
-        elif word == "plugins=[mine]":
-            Path("mine.py").write_text(examples("components", "python")[0])
+        elif word in EXTENSIONS:
+            Path(f"{word[9:-1]}.py").write_text(examples("components", "python")[EXTENSIONS[word]])
+        elif word == "myconf":
+            Path("myconf/data").mkdir(parents=True, exist_ok=True)
+            Path("myconf/data/sway.yaml").write_text(examples("components", "yaml")[1])
         elif word == "my_configs":
             Path("my_configs/data").mkdir(parents=True, exist_ok=True)
-            (mix,) = (block for block in examples("motion", "yaml") if "sources:" in block)
+            (mix,) = (block for block in examples("checks", "yaml") if "sources:" in block)
             Path("my_configs/data/my_mix.yaml").write_text(mix)
             create_placeholders([f"data.root={root}" for root in re.findall(r"root: ([^\s,]+),", mix)])
 
@@ -318,6 +326,9 @@ def test_examples_of_the_guides_work(tmp_path: Path, monkeypatch: pytest.MonkeyP
         exec(test, names)
         names["test_the_stream_is_the_network"]()
         assert build_untrained([*words, "model=causal_conv"]).count_parameters() > 0
+        exec(examples("components", "python")[4], names)
+        names["write_sway"](tmp_path / "sway", clips=2)
+        assert read_clip(tmp_path / "sway/sway_001.npz", "sway").poses.shape[0] == 600
     (tmp_path / "mine.yaml").write_text(examples("sweeps", "yaml")[0])
     sweep = load_sweep(tmp_path / "mine.yaml")
     assert sweep.control == "2, 4, 6, 8"
@@ -327,8 +338,8 @@ def test_examples_of_the_guides_work(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert set(skeleton) == set(SkeletonMap.__dataclass_fields__)
 
 
-def test_the_first_quickstart_lists_every_option():
-    text = (DOCS / "quickstart" / "train.md").read_text(encoding="utf-8")
+def test_the_page_of_switches_lists_every_option():
+    text = (DOCS / "guides" / "switches.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", text, re.MULTILINE))
     groups = {name for name in rows if (ROOT / "conf" / name).is_dir() or component_names(name)}
     assert {"model", "memory", "loss", "rollout"} <= groups

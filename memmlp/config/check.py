@@ -157,7 +157,7 @@ def _explain_type_error(error: OmegaConfBaseException, override: str | None) -> 
     name = str(error.full_key or override)
     schema = error.object_type
     if not dataclasses.is_dataclass(schema) and ("SourceConfig" in str(error) or name.startswith(SOURCES)):
-        return f"{SOURCES}: must be set in a custom config file (docs/guides/motion.md)"
+        return f"{SOURCES}: must be set in a custom config file (docs/guides/checks.md)"
     if isinstance(error, ConfigAttributeError | ConfigKeyError) and not isinstance(
         error, InterpolationKeyError
     ):

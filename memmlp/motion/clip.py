@@ -18,7 +18,7 @@ INTERPOLATIONS = (SPLINES, LINES)
 """The methods of interpolation between two recorded frames.
 
 Splines are as smooth as human motion. Lines have a kink at each recorded frame. For Bandai-Namco's motion at
-30 Hz, that makes the jerk four times as large (docs/guides/motion.md).
+30 Hz, that makes the jerk four times as large (docs/guides/checks.md).
 """
 RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame time of .0083333) is 120
 
