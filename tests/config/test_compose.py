@@ -22,7 +22,7 @@ def test_every_option_composes_and_passes(tmp_path: Path):
         "data=mocap": [root],
         "data=cmu_bandai": [f"data.sources.{source}.root={tmp_path}" for source in ("cmu", "bandai")],
         "data=persons": [root], "data=amass_s1": [root, lists], "data=amass_s2": [root],
-        "data=amass_s3": [root], "data=cmu_s1": [root],
+        "data=amass_s3": [root], "data=cmu_s1": [root], "data=cmu_persons": [root],
         "loss=avatar_poser": ["model=avatar_poser"],
         "loss=of_network": ["model=bodiffusion"], "prerequisite=sage": ["model=sage"],
         **{f"loss={name}": ["model=agrol_mlp"] for name in (*OF_TERMS, "agrol", "rpm", "terms")},

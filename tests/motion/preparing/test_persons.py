@@ -123,6 +123,18 @@ def test_the_shipped_persons_are_in_one_part_of_the_manifest(shipped: MotionSour
         shipped.prepare()
 
 
+def test_the_cmu_persons_are_in_the_same_parts_alone(tmp_path: Path):
+    """Networks that ship are trained on CMU's sets, whose terms allow it."""
+    alone, mixed = compose_split("cmu_persons", tmp_path), compose_split("persons", tmp_path)
+    assert isinstance(alone, PersonSplit)
+    assert isinstance(mixed, PersonSplit)
+    assert alone.parts == {person: part for person, part in mixed.parts.items() if person.startswith("cmu-")}
+    names = [*members(mixed.parts.keys() - {"cmu-60-61", "cmu-indian"}), "cmu-motionbuilder/05/05_01"]
+    names += ["cmu-asfamc/05/05_01", "cmu/indian/04", "bandai-1/dataset-1_walk_sad_001"]
+    expected = {name: part if name[:3] == "cmu" else None for name, part in mixed.assign(names).parts.items()}
+    assert alone.assign(names).parts == expected
+
+
 def test_the_takes_of_s1_are_in_their_lists_part(tmp_path: Path):
     split = compose_split("cmu_s1", tmp_path)
     parts = {
