@@ -232,3 +232,37 @@ def test_subsets_are_found_within_archives_and_by_folders_of_ones_own():
     assert found.parts["amass-2/MPI_HDM05/dg/b"] == "test"
     with pytest.raises(InputError, match=r"data\.split.*CMU/01"):
         SubsetSplit(["KIT"], ["CMU/01"])
+
+
+ARCHIVES = {  # folder in the first release: (folder in later ones, a subject's folder)
+    "ACCAD": ("ACCAD", "Female1General_c3d"), "BMLhandball": ("BMLhandball", "S01_Expert"),
+    "BMLmovi": ("BMLmovi", "Subject_1_F_MoSh"), "BioMotionLab_NTroje": ("BMLrub", "rub001"),
+    "CMU": ("CMU", "01"), "CNRS": ("CNRS", "283"), "DFaust_67": ("DFaust", "50002"),
+    "DanceDB": ("DanceDB", "20120731_StefanosTheodorou"), "EKUT": ("EKUT", "126"),
+    "Eyes_Japan_Dataset": ("EyesJapanDataset", "hamada"), "GRAB": ("GRAB", "s1"),
+    "HUMAN4D": ("HUMAN4D", "S1"), "HumanEva": ("HumanEva", "S1"), "KIT": ("KIT", "3"),
+    "MOYO": ("MOYO", "220923_yogi"), "MPI_HDM05": ("HDM05", "dg"), "MPI_Limits": ("PosePrior", "03099"),
+    "MPI_mosh": ("MoSh", "00008"), "SFU": ("SFU", "0005"), "SOMA": ("SOMA", "soma_subject1"),
+    "SSM_synced": ("SSM", "20160330_03333"), "TCD_handMocap": ("TCDHands", "ExperimentDatabase"),
+    "TotalCapture": ("TotalCapture", "s1"), "Transitions_mocap": ("Transitions", "mazen_c3d"),
+    "WEIZMANN": ("WEIZMANN", "0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("release", ["first", "later", "SMPL-X"])
+def test_all_archives_of_amass_in_each_release(tmp_path: Path, release: str):
+    """The counts of the protocols that docs/guides/amass.md describes, on ten clips of each archive."""
+    first = [f"{top}/{subject}/{n} a clip_poses" for top, (_, subject) in ARCHIVES.items() for n in range(10)]
+    lists = write_lists(tmp_path, [name for name in first if name.startswith(("CMU", "Bio", "MPI_HDM"))])
+    names = [name.replace(top := name.split("/")[0], ARCHIVES[top][0], 1) for name in first]
+    if release == "SMPL-X":
+        names = [name.replace("_poses", "_stageii").replace(" ", "_") for name in names]
+    names = first if release == "first" else names
+    protocols = {"amass_s1": (23, 7), "amass_s2": (120, 20), "amass_s3": (225, 25)}
+    for protocol, expected in protocols.items():
+        words = [f"data={protocol}", f"data.root={tmp_path}", "data.split.val=0"]
+        words += [f"data.split.folder={lists}"] if protocol == "amass_s1" else []
+        split = build_motion(compose_config(words)).clips.split
+        found = Counter(split.assign(names).parts.values())
+        assert (found["train"], found["test"]) == expected
+        assert not split.find_missing_entries(names)
