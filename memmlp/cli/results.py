@@ -137,20 +137,22 @@ def show(name: str, source: str | None, together: tuple[str, ...], folder: Path)
 @folder_option
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 if a page differs.")
 def docs(folder: Path, check: bool) -> None:
-    """Make all pages of results from the kept results, without training.
+    """Make all pages and CSV files of results from the kept results, without training.
 
-    Each file in data/ becomes a page with a table, including the number of finished and missing seeds. Each
+    Each file in data/ becomes a short page with a table, and a CSV file in tables/ with all numbers. Each
     template becomes a page with numbers and verdicts from these tables.
     """
     from memmlp.common.files import atomic_write
-    from memmlp.report.result_pages import MARK, draw_pictures, make_pages
+    from memmlp.report.result_pages import FILES, MARK, draw_pictures, make_pages
 
     templates = {path.name: path.read_text(encoding="utf-8") for path in (folder / "templates").glob("*.md")}
     tables = make_tables(folder)
-    pages = make_pages(tables, templates)
-    present = {path.name: path.read_bytes().decode("utf-8", "replace") for path in folder.glob("*.md")}
-    differing = [name for name, text in pages.items() if present.get(name) != text]
-    stale = sorted(name for name, text in present.items() if text.startswith(MARK) and name not in pages)
+    made = make_pages(tables, templates)
+    paths = [*folder.glob("*.md"), *(folder / FILES).glob("*")]
+    present = {str(path.relative_to(folder)): path.read_bytes().decode("utf-8", "replace") for path in paths}
+    differing = [name for name, text in made.items() if present.get(name) != text]
+    old = present.keys() - made.keys()
+    stale = sorted(name for name in old if present[name].startswith(MARK) or name.startswith(f"{FILES}/"))
     if check:
         for name in [*differing, *stale]:
             click.echo(
@@ -160,15 +162,15 @@ def docs(folder: Path, check: bool) -> None:
         if differing or stale:
             raise SystemExit(1)
     else:
+        (folder / FILES).mkdir(exist_ok=True)
         for name in differing:
-            atomic_write(folder / name, pages[name])
+            atomic_write(folder / name, made[name])
         for name, picture in draw_pictures(tables).items():  # its bytes differ between matplotlib's versions
             if name.replace("_frontier.svg", ".md") in differing or not (folder / name).exists():
                 atomic_write(folder / name, picture)
         for name in stale:
             (folder / name).unlink()
-    count = f"{len(pages)} page{'s' * (len(pages) != 1)}"
-    click.echo(f"{folder}: {count}, {len(differing)} {'differ' if check else 'written'}")
+    click.echo(f"{folder}: {len(made)} files, {len(differing)} {'differ' if check else 'written'}")
 
 
 def make_tables(folder: Path) -> dict[str, KeptTable]:

@@ -1,41 +1,50 @@
-"""Result pages: one for each table, and pages from templates with numbers from the tables."""
+"""Result pages: a short page, a CSV file and remarks for each kept table, and pages from templates."""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import re
+import textwrap
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from memmlp.common.errors import InputError, import_optional
 from memmlp.common.text_formats import escape_markdown
 from memmlp.report.kept_results import KeptResults
-from memmlp.report.pictures.frontier import COST_HEADINGS, draw_frontiers, has_frontier
+from memmlp.report.pictures.frontier import draw_frontiers, has_frontier
+from memmlp.report.tables.flags import join_first
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table import Cell, Row, Table
+from memmlp.report.tables.table import Cell, Effect, Row, Table
 from memmlp.report.tables.table_text import (
     CONFOUNDED,
-    MINUS,
     MISSING,
-    add_unit,
-    count_decimals,
+    describe_branches,
+    describe_power,
     find_unit,
-    format_branch_effect,
     format_counts,
     format_effect,
-    format_number,
-    format_significant,
+    format_mean,
+    format_paper,
     format_value,
+    list_remarks,
     make_caption,
-    to_markdown,
+    make_heading,
+    to_csv,
 )
+from memmlp.sweep.definition import COSTS
 
 MARK = "<!-- made by: memmlp results docs -->"
+FILES = "tables"  # folder of the CSV files and the remarks, below the folder of the pages
+MAX_REMARK = 160  # maximum length of a remark on a page, characters
 ORIGIN = {
     "code": "commit", "torch": "torch", "hardware": "processor", "device": "device", "gpu": "GPU",
     "threads": "threads", "precision": "precision", "data": "data", "body": "body",
 }  # fmt: skip
-REVERSED_VERDICTS = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
+BRANCHES = {"": "branch that the paper prints", "rotation": "rotation branch", "position": "position branch"}
+UNDECIDED = (Verdict.INCONCLUSIVE, Verdict.EQUIVALENT)
 
 
 class KeptTable(NamedTuple):
@@ -53,9 +62,15 @@ class KeptTable(NamedTuple):
     by_source: tuple[Table, ...] = ()
     regroup: Callable[[Sequence[str]], Table] | None = None
 
+    @property
+    def by_clips(self) -> dict[str, Table]:
+        """The tables by the source of their test clips; "all" for all test clips."""
+        names = self.kept.sources if self.by_source else ()
+        return {"all": self.table, **dict(zip(names, self.by_source, strict=True))}
+
 
 def make_pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
-    """Return the texts of all pages by file name.
+    """Return the texts of all pages and of the files beside them, by path below the folder of the pages.
 
     Args:
         sources: the tables by page name, without the suffix.
@@ -64,17 +79,17 @@ def make_pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -
     Raises:
         InputError: if a template and a table have the same page name, or a placeholder has an unknown name.
     """
-    pages = {}
-    for name, source in sorted(sources.items()):
-        tables = "\n".join(map(to_markdown, (source.table, *source.by_source)))
-        frontier = _describe_frontier(name, source.table) if has_frontier(source.table) else ""
-        pages[f"{name}.md"] = f"{MARK}\n\n{tables}\n{frontier}{describe_origin(source.kept)}\n"
-    for name in sorted(pages.keys() & templates.keys()):
+    for name in sorted({f"{one}.md" for one in sources} & templates.keys()):
         raise InputError(f"{name}: a template and a table's page have the same name; rename one of them")
+    made = {}
+    for name, source in sorted(sources.items()):
+        made[f"{name}.md"] = f"{MARK}\n\n{_make_page(name, source)}"
+        made[f"{FILES}/{name}.csv"] = to_csv(source.by_clips)
+    if sources:
+        remarks = {name: _list_all_remarks(source) for name, source in sorted(sources.items())}
+        made[f"{FILES}/remarks.json"] = json.dumps(remarks, indent=1, ensure_ascii=False) + "\n"
     placeholders = Placeholders(sources).collect_functions()
-    return pages | {
-        name: _fill_template(name, text, placeholders) for name, text in sorted(templates.items())
-    }
+    return made | {name: _fill_template(name, text, placeholders) for name, text in sorted(templates.items())}
 
 
 def draw_pictures(sources: Mapping[str, KeptTable]) -> dict[str, bytes]:
@@ -83,19 +98,184 @@ def draw_pictures(sources: Mapping[str, KeptTable]) -> dict[str, bytes]:
     return {f"{name}_frontier.svg": draw_frontiers(table) for name, table in tables.items()}
 
 
-def _describe_frontier(name: str, table: Table) -> str:
-    """Return the picture of error against compute and latency, and a table of costs."""
-    rows = [
-        [
-            row.label,
-            *(format_significant(row.costs[c], 3) if c in row.costs else MISSING for c in COST_HEADINGS),
-        ]
+def _make_page(name: str, source: KeptTable) -> str:
+    """Return a page: what was measured, one table of stream mode with the paper's values, and remarks."""
+    table = source.table
+    parts = [f"# {escape_markdown(make_caption(table))}", " ".join(_describe_table(source))]
+    if has_frontier(table):
+        parts.append(f"![Error against compute and latency, with 95 % intervals]({name}_frontier.svg)")
+    parts.append(_make_series_table(table) if _has_cells(table) else _make_short_table(table))
+    if remarks := [
+        textwrap.shorten(one, MAX_REMARK, placeholder=" …") for one in _list_number_remarks(table)
+    ]:
+        parts.append("\n".join(f"- {escape_markdown(one)}" for one in remarks))
+    parts.append(
+        f"[All numbers]({FILES}/{name}.csv): every mode, branch and source of test clips, with intervals. "
+        f"[Remarks]({FILES}/remarks.json): commits, machines, settings."
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+def _describe_table(source: KeptTable) -> Iterator[str]:
+    """Yield the sentences above a page's table."""
+    kept, table = source.kept, source.table
+    counts = {"run": kept.run_count - kept.untrained_count, "untrained network": kept.untrained_count}
+    runs = " and ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items() if count)
+    groups = max((row.groups for row in table.rows), default=0)
+    tested = f", tested on clips in {groups} groups" if groups else ""
+    yield f"`{make_command(kept)}`: {runs}{tested}."
+    if not table.measured_metrics:
+        return
+    yield f"Mode: {table.modes[0]}; {escape_markdown(describe_branches(table))}."
+    if any(table.list_effects(table.modes[0])):
+        others = "" if _has_several_controls(table) else f" from '{escape_markdown(table.control)}'"
+        yield f"In parentheses: the difference{others} and its [verdict](README.md#verdicts)."
+        yield from _count_by_branch(table)
+        if power := describe_power(table, table.modes[0]):
+            yield f"{power[0].upper()}{power[1:]}."
+    for row in table.rows:
+        if row.confounded:
+            yield escape_markdown(f"{CONFOUNDED} confounded: {row.confounded}.")
+
+
+def _count_by_branch(table: Table) -> Iterator[str]:
+    """Yield the numbers of verdicts, of effects with a sign in the paper if there are any."""
+    mode = table.modes[0]
+    signed = any(cell.paper_effect for *_, cell, _ in table.list_effects(mode))
+    what = "effects with a sign in the paper" if signed else "differences"
+    for branch in BRANCHES:
+        if counts := Counter(_list_verdicts(table, mode, branch, signed)):
+            head = f"In the {branch} branch" if branch else f"Of {counts.total()} {what}"
+            yield f"{head}: {format_counts(counts)}."
+
+
+def _list_verdicts(
+    table: Table, mode: str, branch: str, signed: bool, confounded: bool = False
+) -> list[Verdict]:
+    """Return the verdicts in a branch, "" for each row's branch, of confounded or of other rows.
+
+    With `signed`, only effects with a sign in the paper count.
+    """
+    return [
+        effect.verdict
         for row in table.rows
-        if row.found
+        if bool(row.confounded) == confounded
+        for metric, cell in row.cells[mode].items()
+        if (effect := _find_effect(row, mode, branch, metric)) and effect.verdict
+        if cell.paper_effect or not signed
     ]
-    costs = _make_markdown_table(["variant", *COST_HEADINGS.values()], rows)
-    text = "Error against training compute and live latency, with 95 % intervals over seeds and clip groups:"
-    return f"{text}\n\n![Error against compute and latency]({name}_frontier.svg)\n\n{costs}\n\n"
+
+
+def _find_effect(row: Row, mode: str, branch: str, metric: str) -> Effect | None:
+    if branch in ("", row.branch):
+        return row.cells[mode][metric].effect
+    return row.branches.get(branch, {}).get(mode, {}).get(metric)
+
+
+def _has_several_controls(table: Table) -> bool:
+    return any(row.against not in (None, table.control) for row in table.rows)
+
+
+def _has_cells(table: Table) -> bool:
+    """Return whether the sweep has axes, so that several rows have one series."""
+    return len({row.series for row in table.rows}) < len(table.rows)
+
+
+def _make_short_table(table: Table) -> str:
+    """Return a table with a line for each variant, and a line with the paper's values if there are any."""
+    mode, several = table.modes[0], _has_several_controls(table)
+    lines = []
+    for row in (row for row in table.rows if row.found or row.is_paper_only):
+        cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
+        label = f"{row.label} {CONFOUNDED}" if row.confounded else row.label
+        head = [label, row.against or ""] if several else [label]
+        if row.found:
+            seeds = f"{len(row.found)}/{len(row.wanted)}"
+            lines.append([*head, seeds, *(_describe_cell(cell, metric) for cell, metric in cells)])
+        if any(cell.paper is not None for cell, _ in cells):
+            first = ["" if row.found else one for one in head]
+            lines.append([*first, "paper", *(format_paper(cell, metric) for cell, metric in cells)])
+    heads = ["variant", *(["compared with"] if several else []), "seeds", *map(make_heading, table.metrics)]
+    return _make_markdown_table(heads, lines)
+
+
+def _describe_cell(cell: Cell, metric: str) -> str:
+    """Return a mean, with its difference from the control and the verdict in parentheses."""
+    effect, mean = cell.effect, format_mean(cell, metric)
+    if cell.mean is None or effect is None or (metric in COSTS and cell.paper is None):
+        return mean
+    difference, *ratio = format_effect(cell, metric)
+    if metric in COSTS:
+        return " ".join([mean, *ratio])
+    return f"{mean} ({' '.join(filter(None, [difference.strip('*'), effect.verdict]))})"
+
+
+def _make_series_table(table: Table) -> str:
+    """Return the first metric of a sweep with axes: a line for each point, a column for each series."""
+    mode, metric = table.modes[0], table.metrics[0]
+    series = list(dict.fromkeys(row.series for row in table.rows))
+    points: dict[str, dict[str, Row]] = {}
+    for row in table.rows:
+        points.setdefault(row.label.removeprefix(row.series).lstrip(", "), {})[row.series] = row
+    lines = []
+    for point, rows in points.items():
+        seeds = {f"{len(row.found)}/{len(row.wanted)}" for row in rows.values()}
+        cells = [
+            _describe_point(rows[one].cells[mode][metric], metric) if one in rows else "" for one in series
+        ]
+        lines.append([re.sub(r"[\w.]+\.(\w+=)", r"\1", point), ", ".join(sorted(seeds)), *cells])
+    return f"{make_heading(metric)}:\n\n{_make_markdown_table(['point', 'seeds', *series], lines)}"
+
+
+def _describe_point(cell: Cell, metric: str) -> str:
+    """Return a mean and its difference, with the verdict unless it is inconclusive."""
+    return _describe_cell(cell, metric).replace(f" {Verdict.INCONCLUSIVE})", ")")
+
+
+def _make_markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table; all cells except links are escaped."""
+    cells = [[cell if cell.endswith(")") and cell.startswith("[") else escape_markdown(cell) for cell in row]
+             for row in rows]  # fmt: skip
+    lines = [list(map(escape_markdown, heads)), ["---"] * len(heads), *cells]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _list_number_remarks(table: Table) -> list[str]:
+    """Return the flags about the numbers, not those about the origin of the runs, and remarks on variants."""
+    about_origin = ("code ", "made ", "digest ", "component version", "size", "networks that")
+    flags = [one for one in table.flags if " differs: " not in one and not one.startswith(about_origin)]
+    return [*flags, *(f"{row.label}: {row.note}" for row in table.rows if row.note)]
+
+
+def _list_all_remarks(source: KeptTable) -> dict[str, object]:
+    """Return everything about a table that is not a number: origin, explanations, flags and notes."""
+    remarks = {clips: list_remarks(table) for clips, table in source.by_clips.items()}
+    known = set(remarks["all"])
+    others = {clips: [one for one in lines if one not in known] for clips, lines in remarks.items()}
+    return {"command": make_command(source.kept), "origin": describe_origin(source.kept),
+            "remarks": {**others, "all": remarks["all"]}}  # fmt: skip
+
+
+def make_command(kept: KeptResults) -> str:
+    """Return the command that repeats kept runs, or measures the same untrained networks again."""
+    if kept.run_count > kept.untrained_count:
+        return kept.command
+    return f"{kept.command} --untrained".replace("sweep", "table", 1)
+
+
+def describe_origin(kept: KeptResults) -> list[str]:
+    """Describe the code and the machines that made kept runs."""
+    parts = []
+    for attribute, what in ORIGIN.items():
+        # A run has several values if several machines worked on it or on its prerequisites.
+        values = {one for run in kept.all_runs for one in str(getattr(run.origin, attribute)).split(", ")}
+        if known := sorted(values - {UNKNOWN, ""}):
+            parts.append(f"{what} {', '.join(known)}")
+    parts += sorted({run.origin.partial for run in kept.all_runs if run.origin.partial})
+    versions = sorted({item for run in kept.all_runs for item in run.origin.every_version.items()})
+    if versions:
+        parts.append(f"component versions {', '.join(f'{name} {number}' for name, number in versions)}")
+    return parts
 
 
 def _fill_template(name: str, text: str, placeholders: Mapping[str, object]) -> str:
@@ -109,29 +289,6 @@ def _fill_template(name: str, text: str, placeholders: Mapping[str, object]) -> 
         return f"{MARK}\n\n{environment.from_string(text).render()}"
     except (jinja2.TemplateError, InputError) as error:
         raise InputError(f"{name}: {' '.join(str(error).split())}") from None
-
-
-def describe_origin(kept: KeptResults) -> str:
-    """Describe the command, the code and the machines that made kept runs."""
-    counts = {"run": kept.run_count - kept.untrained_count, "untrained network": kept.untrained_count}
-    parts = [" and ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items() if count)]
-    for attribute, what in ORIGIN.items():
-        # A run has several values if several machines worked on it or on its prerequisites.
-        values = {one for run in kept.all_runs for one in str(getattr(run.origin, attribute)).split(", ")}
-        *others, last = sorted(values - {UNKNOWN}) or [""]
-        if last:
-            parts.append(f"{what} {escape_markdown(' and '.join(filter(None, [', '.join(others), last])))}")
-    parts += sorted({escape_markdown(run.origin.partial) for run in kept.all_runs if run.origin.partial})
-    versions = sorted({item for run in kept.all_runs for item in run.origin.every_version.items()})
-    if versions:
-        parts.append(
-            "component versions "
-            + ", ".join(f"{escape_markdown(name)} {number}" for name, number in versions)
-        )
-    command = kept.command
-    if not counts["run"]:
-        command = f"{command} --untrained".replace("sweep", "table", 1)
-    return f"`{command}`: {', '.join(parts)}."
 
 
 class Placeholders:
@@ -149,146 +306,100 @@ class Placeholders:
         """Return whether there are results with that name."""
         return name in self.sources
 
-    def title(self, name: str) -> str:
-        """Return a table's title."""
-        return escape_markdown(make_caption(self._find_table(name)))
-
-    def origin(self, name: str) -> str:
-        """Describe the command, the code and the machines that made a table's runs."""
-        self._find_table(name)
-        return describe_origin(self.sources[name].kept)
-
     def effect(self, name: str, variant: str, mode: str, metric: str) -> str:
         """Return a measured difference with its interval and verdict: `+1.17 [0.40, 2.23], holds`."""
-        words = format_effect(self._find_cell(name, variant, mode, metric), metric)
-        number = " ".join(word.replace("*", "") for word in words[:2])
-        return f"{number}, {self.verdict(name, variant, mode, metric)}"
-
-    def verdict(self, name: str, variant: str, mode: str, metric: str) -> str:
-        """Return the verdict on a variant's difference, such as `holds`."""
-        effect = self._find_cell(name, variant, mode, metric).effect
-        return "not measured" if effect is None or effect.verdict is None else str(effect.verdict)
+        cell = self._find_cell(name, variant, mode, metric)
+        verdict = (
+            "not measured" if cell.effect is None or cell.effect.verdict is None else cell.effect.verdict
+        )
+        return f"{' '.join(word.replace('*', '') for word in format_effect(cell, metric)[:2])}, {verdict}"
 
     def value(self, name: str, variant: str, mode: str, metric: str) -> str:
         """Return a variant's mean and standard deviation over seeds."""
         return format_value(self._find_cell(name, variant, mode, metric), metric)
 
-    def detectable(self, name: str, mode: str, metric: str, variant: str) -> str:
-        """Return the smallest difference of a variant that is detectable with 80 % power."""
-        effect = self._find_cell(name, variant, mode, metric).effect
-        least = effect.detectable if effect else None
-        return "unknown" if least is None else f"{format_number(least)} {find_unit(metric)}".rstrip()
+    def claims(self, names: Sequence[str], mode: str = "stream") -> str:
+        """Return a table with the verdicts on the paper's effects: a line for each table, a column a branch.
 
-    def summary(self, name: str, mode: str = "stream") -> str:
-        """Return a table with a row for each variant: measured difference, verdict, and printed difference.
-
-        If the table has only costs, the rows show measured costs and the paper's costs.
-        """
-        table, shown = self._find_table(name), [row for row in self._find_table(name).rows if row.found]
-        if metrics := table.measured_metrics:
-            rows = [
-                [
-                    _mark(row),
-                    row.against,
-                    *(self._compare_with_paper(name, row, mode, metric) for metric in metrics),
-                ]
-                for row in shown
-                if row.against
-            ]
-            return f"In {mode} mode:\n\n{_make_markdown_table(['variant', 'compared with', *metrics], rows)}"
-        costs = [row.cells[table.modes[0]] for row in shown]
-        rows = [
-            [row.label, *(_describe_cost(cells[metric], metric) for metric in table.metrics)]
-            for row, cells in zip(shown, costs, strict=True)
-        ]
-        return _make_markdown_table(["variant", *map(add_unit, table.metrics)], rows)
-
-    def _compare_with_paper(self, name: str, row: Row, mode: str, metric: str) -> str:
-        printed = row.cells[mode][metric].paper_effect
-        paper = "" if printed is None else f"; paper {printed:+.2f}".replace("-", MINUS)
-        return f"{self.effect(name, row.label, mode, metric)}{_list_branches(row, mode, metric)}{paper}"
-
-    def held(self, names: Sequence[str], mode: str = "stream") -> str:
-        """Count verdicts on the paper's effects, and list them in a table with a row for each variant.
-
-        Only effects with a sign in the paper count; `-` stands for the others. Confounded rows count apart.
-        Verdicts in other branches than the printed one stand in parentheses.
+        Only effects with a sign in the paper count. Confounded rows count apart, after their mark.
 
         Args:
             names: the names of the tables' results.
             mode: the mode of evaluation.
         """
-        metrics = list(dict.fromkeys(m for name in names for m in self._find_table(name).measured_metrics))
-        rows, counts = [], (Counter[Verdict](), Counter[Verdict]())
+        lines = []
         for name in names:
             table = self._find_table(name)
-            for confounded, found in enumerate(counts):
-                found.update(table.count_verdicts(mode, bool(confounded)))
-            for row in (row for row in table.rows if row.found and row.against):
-                cells = [
-                    self.verdict(name, row.label, mode, metric) + _list_branches(row, mode, metric)
-                    if metric in table.measured_metrics and row.cells[mode][metric].paper_effect
-                    else MISSING
-                    for metric in metrics
-                ]
-                if set(cells) != {MISSING}:
-                    link = f"[{table.number or name}]({name}.md)"
-                    rows.append([link, _mark(row), row.against or "", *cells])
-        sound, apart = counts
-        total = (
-            f"Of {sound.total()} effects with a sign in the paper, in {mode} mode: {format_counts(sound)}."
-        )
-        if apart:
-            total += (
-                f" {apart.total()} confounded effects ({CONFOUNDED}) count apart: {format_counts(apart)}."
-            )
-        return f"{total}\n\n{_make_markdown_table(['table', 'variant', 'compared with', *metrics], rows)}"
+            cells = [self._count_claims([table], mode, branch) for branch in BRANCHES]
+            lines.append([f"[{escape_markdown(make_caption(table))}]({name}.md)", *cells])
+        heads = ["table", *BRANCHES.values()]
+        total = [self._count_claims(map(self._find_table, names), mode, one) for one in BRANCHES]
+        return _make_markdown_table(heads, [*lines, ["all", *total]])
 
-    def steps(self, name: str, mode: str = "stream") -> str:
-        """Return a table of the differences between neighbours in a chain of variants, with percentages.
+    def decisions(self, names: Sequence[str], verdict: str, mode: str = "stream") -> str:
+        """Return the effects with a verdict such as `holds`, in the branch that the paper prints."""
+        found: dict[str, list[str]] = {}
+        for name in names:
+            table = self._find_table(name)
+            for row, metric, cell, effect in table.list_effects(mode):
+                if effect.verdict == verdict and cell.paper_effect:
+                    mark = f" {CONFOUNDED}" if row.confounded else ""
+                    found.setdefault(f"Table {table.number} '{row.label}'{mark}", []).append(metric)
+        return escape_markdown("; ".join(f"{row}: {', '.join(metrics)}" for row, metrics in found.items()))
 
-        In a chain, each variant is the control of the next, and the table's control is the last variant.
-        Without a chain, the text is empty. Percentages refer to the difference between both ends of the
-        chain; they are shown if the interval of this difference excludes 0.
-        """
-        table = self._find_table(name)
-        by_label = {row.label: row for row in table.rows}
-        chain = [by_label[table.control]]
-        while (against := chain[0].against) in by_label and against != table.control:
-            chain.insert(0, by_label[against])
-        if len(chain) < 2:
-            return ""
-        first, *steps = chain
-        metrics = table.measured_metrics
-        rows = [
-            [
-                row.label,
-                *(_describe_step(row.cells[mode][one], first.cells[mode][one], one) for one in metrics),
-            ]
-            for row in steps
-        ]
-        total = f"total, from {first.label}"
-        rows.append([total, *(_describe_reverse(first.cells[mode][metric]) for metric in metrics)])
-        return _make_markdown_table(["step", *metrics], rows)
-
-    def decided(self, name: str, *patterns: str) -> str:
-        """Return how many of a table's differences are significant: `53 of 148`; confounded rows count apart.
+    def overview(self, *patterns: str) -> str:
+        """Return a table of all pages: runs, seeds, and how many differences are significant.
 
         Args:
-            name: the name of the table's results.
-            patterns: regular expressions; clips with equal matches of a pattern become one group.
+            patterns: regular expressions; with equal matches of a pattern, clips become one group in the
+                last column.
         """
-        table, regroup = self._find_table(name), self.sources[name].regroup
-        if patterns:
-            if regroup is None:
-                raise InputError(f"{name}: decided must have no patterns; these clips cannot be regrouped")
-            table = regroup(patterns)
-        counts = (Counter[bool](), Counter[bool]())
-        undecided = (Verdict.INCONCLUSIVE, Verdict.EQUIVALENT)
+        lines, captions = [], [make_caption(one.table) for one in self.sources.values()]
+        for name, source in sorted(self.sources.items()):
+            if not source.table.measured_metrics:
+                continue
+            caption = make_caption(source.table)
+            seeds = sorted({len(row.found) for row in source.table.rows if row.found})
+            coarse = MISSING
+            with contextlib.suppress(InputError):  # no clips to merge
+                coarse = self._count_significant(source.regroup(patterns)) if source.regroup else MISSING
+            caption = f"{caption} ({name})" if captions.count(caption) > 1 else caption
+            link = f"[{escape_markdown(caption)}]({name}.md)"
+            numbers = [str(source.kept.run_count), " to ".join(map(str, sorted({*seeds[:1], *seeds[-1:]})))]
+            lines.append([link, *numbers, self._count_significant(source.table), coarse])
+        heads = ["page", "runs", "seeds", "significant differences", "with a group for each content"]
+        return _make_markdown_table(heads, lines)
+
+    def leaders(self, name: str, metric: str, cost: str, mode: str = "stream") -> str:
+        """Return the variants that no other one beats in both a metric and a cost, by cost."""
+        rows = [row for row in self._find_table(name).rows if row.found and cost in row.costs]
+        best, texts = float("inf"), []
+        for row in sorted(rows, key=lambda row: row.costs[cost]):
+            mean = self._find_cell(name, row.label, mode, metric).mean
+            if mean is not None and mean < best:
+                best = mean
+                number = format_mean(row.cells[mode][metric], metric)
+                texts.append(f"{row.label} {number} {find_unit(metric)} ({cost} {row.costs[cost]:.2g})")
+        return escape_markdown(join_first(texts))
+
+    def _count_claims(self, tables: Iterable[Table], mode: str, branch: str) -> str:
+        counts = [Counter[Verdict](), Counter[Verdict]()]
+        for table in tables:
+            for apart, found in enumerate(counts):
+                found.update(_list_verdicts(table, mode, branch, True, bool(apart)))
+        texts = [
+            f"{mark}{format_counts(found)}"
+            for mark, found in zip(("", f"{CONFOUNDED} "), counts, strict=True)
+            if found
+        ]
+        return "; ".join(texts) or MISSING
+
+    def _count_significant(self, table: Table) -> str:
+        counts = [Counter[bool](), Counter[bool]()]
         for row, *_, effect in (one for mode in table.modes for one in table.list_effects(mode)):
-            counts[bool(row.confounded)][effect.verdict not in undecided] += 1
+            counts[bool(row.confounded)][effect.verdict not in UNDECIDED] += 1
         sound, apart = (f"{found[True]} of {found.total()}" for found in counts)
-        return f"{sound}, and {apart} confounded" if counts[1] else sound
+        return f"{sound}; {CONFOUNDED} {apart}" if counts[1] else sound
 
     def _find_table(self, name: str) -> Table:
         _check_name("results", name, self.sources)
@@ -300,61 +411,6 @@ class Placeholders:
         _check_name("mode", mode, rows[variant].cells)
         _check_name(f"metric of {name}", metric, rows[variant].cells[mode])
         return rows[variant].cells[mode][metric]
-
-
-def _mark(row: Row) -> str:
-    return f"{row.label} {CONFOUNDED}" if row.confounded else row.label
-
-
-def _list_branches(row: Row, mode: str, metric: str) -> str:
-    """Return the differences and verdicts in other branches: ` (rotation +0.69 opposite)`."""
-    effects = {branch: by_mode[mode].get(metric) for branch, by_mode in row.branches.items()}
-    cell = row.cells[mode][metric]
-    words = [
-        f"{branch} {' '.join(format_branch_effect(effect, cell)).replace('*', '')}"
-        for branch, effect in effects.items()
-        if effect
-    ]
-    words += [f"{branch} not recorded" for branch in row.unrecorded]
-    return f" ({', '.join(words)})" if words else ""
-
-
-def _make_markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; all cells except links are escaped."""
-    cells = [
-        [cell if cell and cell.endswith(".md)") else escape_markdown(cell or "") for cell in row]
-        for row in rows
-    ]
-    lines = [list(map(escape_markdown, heads)), ["---"] * len(heads), *cells]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _describe_cost(cell: Cell, metric: str) -> str:
-    return format_value(cell, metric) + ("" if cell.paper is None else f"; paper {cell.paper:.2f}")
-
-
-def _describe_step(step: Cell, total: Cell, metric: str) -> str:
-    """Return a step's difference, its percentage of the chain's total difference, and its verdict."""
-    if step.effect is None:
-        return MISSING
-    words = [format_effect(step, metric)[0].replace("*", "")]
-    if total.effect is not None and (total.effect.low or 0) * (total.effect.high or 0) > 0:
-        words.append(f"{round(100 * step.effect.mean / -total.effect.mean)} %".replace("-", MINUS))
-    return ", ".join([*words, str(step.effect.verdict or "no verdict")])
-
-
-def _describe_reverse(cell: Cell) -> str:
-    """Return the difference from a variant to its control, with the reversed verdict."""
-    if cell.effect is None:
-        return MISSING
-    verdict = (
-        REVERSED_VERDICTS.get(cell.effect.verdict, cell.effect.verdict)
-        if cell.effect.verdict
-        else "no verdict"
-    )
-    printed = "" if cell.paper_effect is None else f"; paper {-cell.paper_effect:+.2f}"
-    digits = 2 if cell.mean is None else count_decimals(cell.mean)
-    return f"{-cell.effect.mean:+.{digits}f}, {verdict}{printed}".replace("-", MINUS)
 
 
 def _check_name(kind: str, name: str, choices: Iterable[str]) -> None:

@@ -15,16 +15,16 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     templates.mkdir()
     (templates / "README.md").write_text('{{ effect("table14", "2", "stream", "MPJPE") }}\n')
     assert memmlp("results", "docs", "--check").code == 1
-    assert memmlp("results", "docs").out == "docs/results: 2 pages, 2 written\n"
-    assert memmlp("results", "docs", "--check").out == "docs/results: 2 pages, 0 differ\n"
-    page = Path("docs/results/table14.md")
-    text = page.read_text()
-    assert text.count("| 3/3 |") == 8
+    assert memmlp("results", "docs").out == "docs/results: 4 files, 4 written\n"
+    assert memmlp("results", "docs", "--check").out == "docs/results: 4 files, 0 differ\n"
+    assert Path("docs/results/table14.md").read_text().count("| 3/3 |") == 4
     assert ", inconclusive" in Path("docs/results/README.md").read_text()
-    page.write_text(text.replace("inconclusive", "holds", 1))
-    assert "docs/results/table14.md: differs" in memmlp("results", "docs", "--check").err
-    memmlp("results", "docs")
-    assert page.read_text() == text
+    for path in (Path("docs/results/table14.md"), Path("docs/results/tables/table14.csv")):
+        text = path.read_text()
+        path.write_text(text.replace("inconclusive", "holds", 1))
+        assert f"{path}: differs" in memmlp("results", "docs", "--check").err
+        memmlp("results", "docs")
+        assert path.read_text() == text
 
 
 def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
@@ -41,11 +41,11 @@ def test_one_kept_seed_of_three_is_no_finished_table(memmlp: Memmlp, planned: No
     memmlp("results", "save", "14", "seed=1")
     memmlp("results", "docs")
     page = Path("docs/results/table14.md")
-    assert (page.read_text().count("| 1/3 |"), page.read_text().count("| 1/1 |")) == (8, 0)
+    assert (page.read_text().count("| 1/3 |"), page.read_text().count("| 1/1 |")) == (4, 0)
     assert "missing: every variant's seed 0, 2; fill with: memmlp sweep table14" in page.read_text()
     memmlp("results", "save", "14", "seed=0,1,2,3")
     memmlp("results", "docs")
-    assert page.read_text().count("| 4/4 |") == 8
+    assert page.read_text().count("| 4/4 |") == 4
 
 
 def test_pages_without_data_go(memmlp: Memmlp, planned: None):
@@ -55,7 +55,8 @@ def test_pages_without_data_go(memmlp: Memmlp, planned: None):
     Path("docs/results/data/small.json").unlink()
     assert "small.md" in memmlp("results", "docs", "--check").err
     memmlp("results", "docs")
-    assert [path.name for path in Path("docs/results").glob("*.md")] == ["notes.md"]
+    left = {str(path) for path in Path("docs/results").rglob("*.*")}
+    assert left == {"docs/results/notes.md"}
 
 
 def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None):

@@ -10,16 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import fake_sweep, runs_of
-from report.conftest import GROUPS
 
 from memmlp.cli.results import make_tables
 from memmlp.common.errors import InputError
-from memmlp.report.kept_results import KeptResults, list_overrides
-from memmlp.report.result_pages import KeptTable, Placeholders, make_pages
+from memmlp.common.text_formats import parse_csv
+from memmlp.report.kept_results import KeptResults
+from memmlp.report.result_pages import KeptTable, make_pages
 from memmlp.report.tables.build_table import group_clips, make_table
 from memmlp.report.tables.statistics import Verdict, estimate_error
-from memmlp.report.tables.table_text import MINUS
 from memmlp.sweep.definition import Sweep
 
 ROOT = Path(__file__).parent.parent.parent
@@ -37,10 +35,8 @@ def fill(template: str, table: KeptTable) -> str:
 def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept: KeptResults):
     made = source(sweep, kept)
     template = (
-        'MPJPE {{ effect("t", "2", "stream", "MPJPE") }}; '
-        '{{ value("t", "2", "stream", "MPJPE") }}. {{ verdict("t", "2, 4, 6", "window", "Jitter") }} '
-        '{{ detectable("t", "stream", "MPJPE", "2") }} {% if has("u") %}never{% endif %}\n'
-        '{{ title("t") }}\n{{ origin("t") }}\n{{ summary("t") }}'
+        'MPJPE {{ effect("t", "2", "stream", "MPJPE") }}; {{ value("t", "2", "stream", "MPJPE") }}. '
+        '{% if has("u") %}never{% endif %}{{ decisions(["t"], "holds") }}'
     )
     text = fill(template, made)
     row = next(row for row in made.table.rows if row.label == "2")
@@ -48,26 +44,70 @@ def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept
     assert effect.verdict == Verdict.HOLDS
     assert f"MPJPE +{effect.mean:.2f} [{effect.low:.2f}, {effect.high:.2f}], holds" in text
     assert f"{row.cells['stream']['MPJPE'].mean:.2f} ± " in text
-    assert f"{effect.detectable:.2g} cm" in text
-    assert "`memmlp sweep table14 data=mocap`: 12 runs, commit 0123456, torch 2.0.0" in text
-    assert len(re.findall(r"holds \(rotation [^)]+\); paper \+0.09", text)) == 1
+    assert re.search(r"'2': \w.*MPJPE", text)
     assert "never" not in text
 
 
-def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: KeptResults):
-    """Counted again from the cells; an effect without a sign in the paper is not."""
+def test_a_page_has_each_mean_and_its_file_every_number(sweep: Sweep, kept: KeptResults):
     made = source(sweep, kept)
-    text = fill('{{ held(["t"]) }}', made)
-    cells = [row.cells["stream"][metric] for row in made.table.rows for metric in made.table.measured_metrics]
-    signed = [cell for cell in cells if cell.paper_effect]
-    holds = sum(cell.effect.verdict == Verdict.HOLDS for cell in signed)
-    assert 0 < holds < len(signed) == 12
-    assert f"Of {len(signed)} effects with a sign in the paper, in stream mode: {holds} holds, " in text
-    line = next(line for line in text.splitlines() if line.startswith("| [14](t.md) | 2 |"))
-    row = next(row for row in made.table.rows if row.label == "2")
-    words = [str(row.cells["stream"][metric].effect.verdict) for metric in made.table.measured_metrics]
-    bare = re.sub(r" \(rotation [^)]+\)", "", line)  # without the other branches
-    assert bare == f"| [14](t.md) | 2 | 2, 4, 6, 8 | {' | '.join(words)} |" != line
+    files = make_pages({"t": made}, {})
+    lines = {
+        (line["variant"], line["mode"], line["branch"], line["metric"]): line
+        for line in parse_csv(files["tables/t.csv"])
+        if line["test clips"] == "all"
+    }
+    for row, mode in itertools.product(made.table.rows, made.table.modes):
+        for metric, cell in row.cells[mode].items():
+            line = lines[row.label, mode, row.branch, metric]
+            assert float(line["mean"]) == pytest.approx(cell.mean, rel=1e-4)
+            assert line["verdict"] == ("" if cell.effect is None else cell.effect.verdict)
+            assert f" {cell.mean:.2f} " in files["t.md"] or mode != made.table.modes[0]
+        for branch, by_mode in row.branches.items():
+            for metric, effect in by_mode[mode].items():
+                line = lines[row.label, mode, branch, metric]
+                numbers = [float(line[f"difference{end}"]) for end in ("", " low", " high")]
+                assert numbers == pytest.approx([effect.mean, effect.low, effect.high], rel=1e-4)
+    assert {branch for *_, branch, _ in lines} > {"rotation", "position"}
+    remarks = json.loads(files["tables/remarks.json"])["t"]
+    assert "commit 0123456" in remarks["origin"]
+    assert remarks["command"] == "memmlp sweep table14 data=mocap"
+
+
+def test_what_holds_of_the_paper_is_counted(sweep: Sweep, kept: KeptResults):
+    """Counted again from the cells, by branch; an effect without a sign in the paper does not count."""
+    made = source(sweep, kept)
+    line = fill('{{ claims(["t"]) }}', made).splitlines()[-2]
+    cells = [cell for row in made.table.rows for cell in row.cells["stream"].values() if cell.paper_effect]
+    holds = sum(cell.effect.verdict == Verdict.HOLDS for cell in cells)
+    assert 0 < holds < len(cells) == 12
+    link, printed, rotation, _ = line.strip("| ").split(" | ")
+    assert link.endswith("(t.md)")
+    counts = [{word: int(n) for n, word in re.findall(r"(\d+) (\w+)", one)} for one in (printed, rotation)]
+    assert counts[0]["holds"] == holds
+    assert sum(counts[0].values()) == sum(counts[1].values()) == 12
+    effects = [
+        row.branches["rotation"]["stream"][m]
+        for row in made.table.rows
+        if row.against
+        for m in row.cells["stream"]
+    ]
+    assert counts[1].get("holds", 0) == sum(effect.verdict == Verdict.HOLDS for effect in effects)
+
+
+def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResults):
+    made = source(sweep, kept)
+    errors = [row.cells["stream"]["MPJPE"].mean for row in made.table.rows]
+    costs = np.argsort(np.argsort(errors)[::-1]) + 1.0  # the larger the error, the smaller the cost
+    costs[1] = 9  # the largest cost
+    rows = [replace(row, costs={"ms": cost}) for row, cost in zip(made.table.rows, costs, strict=True)]
+    made = made._replace(table=replace(made.table, rows=tuple(rows)))
+    text = fill('{{ leaders("t", "MPJPE", "ms") }}', made)
+    better = [
+        all(one == two or errors[two] > errors[one] or costs[two] > costs[one] for two in range(len(rows)))
+        for one in range(len(rows))
+    ]
+    assert 1 < sum(better) < len(rows)
+    assert [f"(ms {cost:.2g})".replace(".0", "") in text for cost in costs] == better
 
 
 def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Sweep, kept: KeptResults):
@@ -79,19 +119,19 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
         return make_table(sweep, group_clips(kept.select_runs(sweep), ["."])[0])
 
     made = made._replace(regroup=coarser)
-    text = fill('{{ decided("t") }}, {{ decided("t", "a", "b") }}', made).splitlines()[-1]
+    line = fill('{{ overview("a", "b") }}', made).splitlines()[-1]
     cells = [cell for row in made.table.rows for own in row.cells.values() for cell in own.values()]
     effects = [cell.effect for cell in cells if cell.effect and cell.effect.verdict]
     significant = sum(effect.holm < 0.05 for effect in effects)
     assert 0 < significant < len(effects)
-    assert text == f"{significant} of {len(effects)}, 0 of {len(effects)}"
+    assert line.endswith(f"| 12 | 3 | {significant} of {len(effects)} | 0 of {len(effects)} |")
 
 
 @pytest.mark.parametrize(("template", "words"), [
     ('{{ effect("u", "2", "stream", "MPJPE") }}', "'u'"),
     ('{{ effect("t", "3", "stream", "MPJPE") }}', "'3'"),
     ('{{ effect("t", "2", "live", "MPJPE") }}', "'live'"),
-    ('{{ effect("t", "2", "stream", "MPJ") }}', "'MPJ'"), ('{{ decided("t", "a") }}', "t: "),
+    ('{{ effect("t", "2", "stream", "MPJ") }}', "'MPJ'"), ('{{ claims(["u"]) }}', "'u'"),
     ("{{ nothing }}", "'nothing' is undefined"), ("{{ effect(", "README.md"),
 ])  # fmt: skip
 def test_bad_templates_are_one_line(sweep: Sweep, kept: KeptResults, template: str, words: str):
@@ -112,27 +152,35 @@ def test_pages_of_the_clone_are_made_again_byte_for_byte():
     templates = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "templates").glob("*.md")}
     made = make_pages(clones_tables(), templates)
     assert "README.md" in made
+    assert {f"tables/{name}.csv" for name in clones_tables()} < set(made)
     for name, text in made.items():
         assert (DOCS / name).read_bytes() == text.encode(), name
 
 
 @pytest.mark.slow
 def test_every_interval_of_the_clone_follows_from_what_is_kept():
-    """As many intervals as the pages print are computed here from the per-clip results, and are equal."""
+    """The intervals in the files are computed here from the per-clip results, and are equal."""
     for name in ("mix", "networks", "table14"):  # the first two have several sources
-        one, printed = clones_tables()[name], 0
+        one = clones_tables()[name]
         content = json.loads((DOCS / "data" / f"{name}.json").read_text())
-        sources_of = [None, *(one.kept.sources if one.by_source else ())]
-        for source_name, table in zip(sources_of, (one.table, *one.by_source), strict=True):
-            for row, mode in itertools.product(table.rows, table.modes):
-                for metric, cell in row.cells.get(mode, {}).items():
-                    printed += cell.low is not None and table.number is None  # of the mean itself
-                    if cell.effect is not None and cell.effect.low is not None:
-                        interval = by_hand(content, row, table, mode, metric, source_name)
-                        assert (cell.effect.low, cell.effect.high) == pytest.approx(interval)
-                        printed += 1
-        text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
-        assert len(re.findall(r"\\\[[^\]]*\d, [^\]]*\d\\\]", text)) == printed
+        lines = parse_csv((DOCS / "tables" / f"{name}.csv").read_text())
+        rows = {(clips, row.label): row for clips, table in one.by_clips.items() for row in table.rows}
+        checked = 0
+        for line in lines:
+            row = rows[line["test clips"], line["variant"]]
+            if line["difference low"] and line["branch"] == row.branch:
+                clips = None if line["test clips"] == "all" else line["test clips"]
+                table = one.by_clips[line["test clips"]]
+                interval = by_hand(content, row, table, line["mode"], line["metric"], clips)
+                shown = float(line["difference low"]), float(line["difference high"])
+                assert shown == pytest.approx(interval, rel=1e-4)
+                checked += 1
+        assert checked == sum(
+            cell.effect is not None and cell.effect.low is not None
+            for row in rows.values()
+            for cells in row.cells.values()
+            for cell in cells.values()
+        )
 
 
 def by_hand(content: dict, row, table, mode: str, metric: str, source: str | None) -> tuple[float, float]:
@@ -157,26 +205,3 @@ def by_hand(content: dict, row, table, mode: str, metric: str, source: str | Non
     differences = (sides[0] - sides[1])[None]
     half = estimate_error(differences, np.array(list(groups.values()))).compute_half_width(0.05)[0]
     return float(differences.mean() - half), float(differences.mean() + half)
-
-
-def test_the_way_from_the_first_variant_to_the_last_is_the_sum_of_its_steps(sweep: Sweep, tmp_path: Path):
-    """Errors grow from arm to arm of a chain; a share is shown where the interval leaves 0 out."""
-    labels = [arm.label for arm in sweep.variants]
-    against = {labels[0]: labels[1], labels[1]: labels[2], labels[2]: labels[0]}  # the control, two before it
-    variants = tuple(replace(variant, against=against.get(variant.label)) for variant in sweep.variants)
-    chained = replace(sweep, variants=variants, control=labels[0])
-    find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
-
-    def make_words(one: Sweep) -> Placeholders:
-        kept = KeptResults("table14", (), runs_of(one, find), list_overrides(one))
-        return Placeholders({"t": source(one, kept)})
-
-    words = make_words(chained)
-    rows = [line.split(" | ") for line in words.steps("t").splitlines()[2:]]
-    assert [row[0].strip("| ") for row in rows] == [labels[1], labels[0], f"total, from {labels[2]}"]
-    column = 1 + chained.metrics.index("MPJPE")
-    parts = [[word.replace(MINUS, "-") for word in row[column].split(", ")] for row in rows]
-    assert float(parts[0][0]) + float(parts[1][0]) == pytest.approx(float(parts[2][0]), abs=0.011)
-    assert [part[1] for part in parts[:2]] == ["67 %", "33 %"]  # 1.3 to 1.1 to 1
-    assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
-    assert make_words(sweep).steps("t") == ""

@@ -14,10 +14,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COMPUTE, LATENCY = "tflop", "ms"
-COST_HEADINGS = {
-    "parameters": "parameters [M]", "MACs": "MACs [G]", COMPUTE: "training [TFLOP]",
-    "seconds": "training [s]", LATENCY: "step [ms]",
-}  # fmt: skip
 MIN_RATIO = 1.1  # minimum ratio between two budgets of a frontier
 
 

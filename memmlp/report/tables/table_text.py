@@ -7,13 +7,13 @@ import json
 import math
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 from rich.console import Console
 
 from memmlp.common.files import make_json_safe
-from memmlp.common.text_formats import escape_latex, escape_markdown
+from memmlp.common.text_formats import escape_latex, escape_markdown, format_csv
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.tables.flags import join_quoted
 from memmlp.report.tables.statistics import Verdict
@@ -94,7 +94,8 @@ def make_caption(table: Table) -> str:
 
 def make_legend(table: Table) -> list[str]:
     """Return the lines that explain branches, measured values, verdicts and statistical power."""
-    lines = [_describe_branch(table)] if table.measured_metrics else []
+    source = f" ({table.branch_source})" if table.branch_source else ""
+    lines = [f"{describe_branches(table)}{source}"] if table.measured_metrics else []
     if not any(row.found for row in table.rows):
         return lines
     if table.measured_metrics:
@@ -108,21 +109,22 @@ def make_legend(table: Table) -> list[str]:
                 f"{', '.join(parts)} seeds, which share the 5 %; (3): decided at 3 seeds, and final; means "
                 "and intervals use all seeds"
             )
-        lines += [*_explain_branches(table), *_explain_flips(table), *_describe_power(table)]
+        lines += [*_explain_branches(table), *_explain_flips(table)]
+        lines += [f"{mode} mode: {text}" for mode in table.modes if (text := describe_power(table, mode))]
     if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
         lines.append(_summarize_agreement(table))
     return lines
 
 
-def _describe_branch(table: Table) -> str:
-    """Describe the branches of the rows, and the evidence for the branch of the paper's values."""
-    branches = [row.branch for row in table.rows if not row.is_paper_only]
-    # The most frequent branch; the first branch if several are equally frequent.
-    most = max(dict.fromkeys(branches), key=lambda branch: sum(row.branch == branch for row in table.rows))
-    others = [f"'{row.label}' {row.branch}" for row in table.rows if row.branch != most]
-    parts = [most, ", ".join(others)] if len(set(branches)) > 1 else [most]
-    source = f" ({table.branch_source})" if table.branch_source else ""
-    return f"errors of the branch: {'; '.join(parts)}{source}"
+def describe_branches(table: Table) -> str:
+    """Describe the branches of the rows: the most frequent one, and the variants with others."""
+    labels: dict[str, list[str]] = {}
+    for row in table.rows:
+        if not row.is_paper_only:
+            labels.setdefault(row.branch, []).append(row.label)
+    most, *others = sorted(labels, key=lambda branch: -len(labels[branch]))
+    texts = [f"{branch} for {join_quoted(labels[branch])}" for branch in others]
+    return f"errors of the branch: {most}{' (' * bool(texts)}{'; '.join(texts)}{')' * bool(texts)}"
 
 
 def _explain_differences(table: Table) -> str:
@@ -191,32 +193,29 @@ def _explain_flips(table: Table) -> list[str]:
     ]
 
 
-def _describe_power(table: Table) -> list[str]:
-    lines = []
+def describe_power(table: Table, mode: str) -> str:
+    """Describe the differences that every variant detects with 80 % power; empty if these are unknown.
+
+    A difference larger than all values of its metric says only that there are too few seeds.
+    """
+    found, lost, blind = [], [], dict[str, None]()
     for metric in table.measured_metrics:
-        least = {
-            mode: value for mode in table.modes if (value := table.find_detectable(mode, metric)) is not None
-        }
-        parts = []
-        for mode, value in least.items():
-            means = [cell.mean for _, name, cell, _ in table.list_effects(mode) if name == metric]
-            finite = [mean for mean in means if mean is not None and math.isfinite(mean)]
-            if value <= max(finite, default=0.0):
-                parts.append(f"{format_number(value)} ({mode})")
-        if parts:
-            blind = dict.fromkeys(
-                label for mode in least for label in table.list_blind_variants(mode, metric)
-            )
-            but = f" but {', '.join(repr(label) for label in blind)}" if blind else ""
-            lines.append(
-                f"{metric}: a true difference of {' or '.join(parts)} {find_unit(metric)} would have been "
-                f"found in every variant{but} with 80 % power, a smaller one perhaps not"
-            )
-        elif least:
-            lines.append(
-                f"{metric}: too few seeds, a difference as large as the values can be missed in some variant"
-            )
-    return lines
+        if (least := table.find_detectable(mode, metric)) is None:
+            continue
+        means = [cell.mean for _, name, cell, _ in table.list_effects(mode) if name == metric]
+        finite = [mean for mean in means if mean is not None and math.isfinite(mean)]
+        if least <= max(finite, default=0.0):
+            found.append(f"{metric} {format_number(least)} {find_unit(metric)}".rstrip())
+            blind |= dict.fromkeys(table.list_blind_variants(mode, metric))
+        else:
+            lost.append(metric)
+    but = f" but {', '.join(map(repr, blind))}" if blind else ""
+    texts = []
+    if found:
+        texts.append(f"with 80 % power, every variant{but} shows a true difference of {', '.join(found)}")
+    if lost:
+        texts.append(f"too few seeds to find even a difference as large as the values: {', '.join(lost)}")
+    return "; ".join(texts)
 
 
 def _summarize_agreement(table: Table) -> str:
@@ -265,13 +264,20 @@ def _format_interval(table: Table, cell: Cell) -> tuple[str, ...]:
 
 def format_value(cell: Cell, metric: str) -> str:
     """Return mean ± standard deviation over seeds; only the mean for costs, except for the column `ms`."""
+    if cell.mean is None or cell.sd is None or (metric in COSTS and metric != "ms"):
+        return format_mean(cell, metric)
+    digits = count_decimals(cell.mean)
+    missing = describe_missing_clips(cell.counted, cell.clips)
+    return f"{cell.mean:.{digits}f} ± {cell.sd:.{digits}f}{missing}"
+
+
+def format_mean(cell: Cell, metric: str) -> str:
+    """Return the mean over seeds, with the number of clips if some have no value."""
     if cell.mean is None:
         return MISSING
-    if metric in COSTS and (metric != "ms" or cell.sd is None):
+    if metric in COSTS:
         return format_significant(cell.mean, 3)
-    digits = count_decimals(cell.mean)
-    sd = "" if cell.sd is None else f" ± {cell.sd:.{digits}f}"
-    return f"{cell.mean:.{digits}f}{sd}{describe_missing_clips(cell.counted, cell.clips)}"
+    return f"{cell.mean:.{count_decimals(cell.mean)}f}{describe_missing_clips(cell.counted, cell.clips)}"
 
 
 def describe_missing_clips(counted: int, clips: int) -> str:
@@ -371,7 +377,7 @@ def to_markdown(table: Table) -> str:
         rows += [list(map(escape_markdown, line)) for line in grid.lines]
         text = "\n".join(f"| {' | '.join(row)} |" for row in rows)
         parts.append(f"**{grid.mode}**\n\n{text}" if grid.mode else text)
-    remarks = "\n".join(f"- {escape_markdown(line)}" for line in _list_remarks(table))
+    remarks = "\n".join(f"- {escape_markdown(line)}" for line in list_remarks(table))
     return "\n\n".join([*parts, remarks] if remarks else parts) + "\n"
 
 
@@ -389,7 +395,7 @@ def to_latex(table: Table) -> str:
         lines += [" & ".join(map(escape_latex, line)) + r" \\" for line in grid.lines]
     lines += [r"\bottomrule", r"\end{tabular}"]
     lines += [
-        rf"\par\smallskip\raggedright\footnotesize {escape_latex(line)}." for line in _list_remarks(table)
+        rf"\par\smallskip\raggedright\footnotesize {escape_latex(line)}." for line in list_remarks(table)
     ]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
 
@@ -405,6 +411,62 @@ def to_json(table: Table) -> str:
     return json.dumps(make_json_safe(fields), indent=2, ensure_ascii=False) + "\n"
 
 
+CSV_HEADINGS = (
+    "test clips", "variant", "mode", "branch", "metric", "unit", "seeds", "planned seeds", "clips", "mean",
+    "sd", "low", "high", "compared with", "difference", "difference low", "difference high", "p",
+    "corrected p", "equivalence p", "sign-flip p", "verdict", "decided at seeds", "detectable", "paper",
+    "paper difference", "confounded",
+)  # fmt: skip
+
+
+def to_csv(tables: Mapping[str, Table]) -> str:
+    """Return all numbers of tables as CSV: a line for each variant, mode, branch and metric.
+
+    Args:
+        tables: the tables by the test clips that they are about.
+    """
+    lines = (
+        [clips, *line]
+        for clips, table in tables.items()
+        for row in table.rows
+        for line in _list_numbers(table, row)
+    )
+    return format_csv([CSV_HEADINGS, *lines])
+
+
+def _list_numbers(table: Table, row: Row) -> Iterator[list[object]]:
+    """Yield a variant's lines of CSV: its metrics, its other costs, and its effects in other branches."""
+    seeds = [len(row.found), len(row.wanted)]
+    for mode, cells in row.cells.items():
+        for metric, cell in cells.items():
+            if cell.values or cell.paper is not None:
+                head = ["", ""] if metric in COSTS else [mode, row.branch]
+                numbers = [cell.counted or "", cell.mean, cell.sd, cell.low, cell.high]
+                yield _make_csv_line(row, [*head, metric], [*seeds, *numbers], cell.effect, cell)
+    for name in (one for one in row.costs if one not in table.metrics):
+        unit = {"tflop": "TFLOP", "seconds": "s"}.get(name, find_unit(name))
+        line = [row.label, "", "", name, unit, *seeds, "", _shorten(row.costs[name])]
+        yield [*line, *[""] * (len(CSV_HEADINGS) - len(line) - 1)]
+    for branch, by_mode in row.branches.items():
+        for mode, metric, effect in ((m, key, one) for m in table.modes for key, one in by_mode[m].items()):
+            yield _make_csv_line(row, [mode, branch, metric], [*seeds, *[""] * 5], effect)
+
+
+def _make_csv_line(
+    row: Row, head: Sequence[str], numbers: Sequence[object], effect: Effect | None, cell: Cell | None = None
+) -> list[object]:
+    names = ("mean", "low", "high", "p", "holm", "equal", "flips", "verdict", "decided", "detectable")
+    line = [row.label, *head, find_unit(head[-1]), *numbers, row.against if effect else ""]
+    line += [getattr(effect, name) if effect else "" for name in names]
+    line += [cell.paper, cell.paper_effect] if cell else ["", ""]
+    return [_shorten(one) for one in (*line, row.confounded)]
+
+
+def _shorten(value: object) -> object:
+    """Return a number with five significant digits, and an empty text for None."""
+    return f"{value:.5g}" if isinstance(value, float) else "" if value is None else str(value)
+
+
 def print_table(table: Table, console: Console) -> None:
     """Print the table on a terminal; columns that do not fit go into additional blocks below."""
     console.print(make_caption(table), style="bold", soft_wrap=True)
@@ -413,7 +475,7 @@ def print_table(table: Table, console: Console) -> None:
             console.print(f"{grid.mode} mode", style="italic")
         for columns in _divide_columns(grid, console.width):
             console.out("\n".join(_format_lines(grid, columns)), "", sep="\n", highlight=False)
-    for line in _list_remarks(table):
+    for line in list_remarks(table):
         console.print(f"- {line}")
     console.print()
 
@@ -421,7 +483,8 @@ def print_table(table: Table, console: Console) -> None:
 FORMATS: dict[str, Callable[[Table], str]] = {"md": to_markdown, "tex": to_latex, "json": to_json}
 
 
-def _list_remarks(table: Table) -> list[str]:
+def list_remarks(table: Table) -> list[str]:
+    """Return all lines below a table: explanations, flags and notes."""
     return [*make_legend(table), *table.flags, *table.notes]
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from fake_runs import fake_run, table_of
 
+from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
 from memmlp.report.pictures.frontier import draw_frontiers, has_frontier, list_points
 from memmlp.report.result_pages import KeptTable, draw_pictures, make_pages
@@ -56,13 +57,17 @@ def test_one_budget_or_an_unknown_one_is_no_frontier(table: Table):
     assert not has_frontier(replace(table, rows=tuple(replace(row, costs={}) for row in table.rows)))
 
 
-def test_the_page_has_a_picture_and_the_costs(table: Table):
+def test_the_page_has_a_picture_and_its_file_the_costs(table: Table):
     """The picture is the same each time, with a line for each network."""
     kept = KeptResults("budgets", (), {}, {})
     sources = {"budgets": KeptTable(kept, table)}
-    page = make_pages(sources, {})["budgets.md"]
-    assert "(budgets_frontier.svg)" in page
-    assert "| RPM, optim.tflop=20 | 0.357 | 0.013 | 20.1 | 300 |" in page
+    made = make_pages(sources, {})
+    assert "(budgets_frontier.svg)" in made["budgets.md"]
+    costs = {
+        (line["variant"], line["metric"]): line["mean"] for line in parse_csv(made["tables/budgets.csv"])
+    }
+    assert float(costs["RPM, optim.tflop=20", "tflop"]) == pytest.approx(20.05)
+    assert costs["RPM, optim.tflop=20", "seconds"] == "300"
     (picture,) = draw_pictures(sources).values()
     assert picture == draw_frontiers(table)
     assert len(set(re.findall(rb"<!-- (Mem-MLP|RPM|VAE-HMD) -->", picture))) == 3

@@ -35,7 +35,7 @@ def test_what_the_table_could_have_seen(table: Table, sweep: Sweep, tmp_path: Pa
     """A table could have seen the largest of what its variants could, and here a larger effect."""
     least = [cell(table, label, "MPJPE").effect.detectable for label in ("no | memory", "by position")]
     assert table.find_detectable("stream", "MPJPE") == max(least)
-    assert f"MPJPE: a true difference of {max(least):.2g} (stream)" in printed(table, 200)
+    assert f"MPJPE {max(least):.2g} cm" in printed(table, 200)
     assert cell(table, "no | memory", "MPJPE").effect.mean > least[0]
 
 

@@ -62,7 +62,7 @@ def test_an_variant_in_which_nothing_would_have_been_found_is_named(sweep: Sweep
         sweep, lambda variant, seed: find(variant, seed) if variant.label != one_seed or seed == 0 else None
     )
     said = " ".join(printed(table, 100).split())
-    assert f"found in every variant but '{one_seed}' with 80 % power, a smaller one perhaps not" in said
+    assert f"every variant but '{one_seed}' shows a true difference" in said
     assert "in every variant but" not in " ".join(printed(table_of(sweep, find), 100).split())
 
 
@@ -72,7 +72,7 @@ def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeyp
     monkeypatch.setattr(Table, "find_detectable", lambda *_: 901.0)
     said = " ".join(printed(table, 100).split())
     assert "901" not in said
-    assert "MPJRE: too few seeds" in said
+    assert re.search("too few seeds[^;]*: MPJRE", said)
 
 
 def test_power_is_that_of_the_table_where_a_run_diverged(table: Table):
