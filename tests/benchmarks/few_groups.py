@@ -1,17 +1,16 @@
-"""Simulate tables with few groups, such as persons, and count false claims of both kinds of p-values.
+"""Simulate tables with few groups, such as persons, and count false claims of p and of resampled p-values.
 
-docs/results/verdicts.md has the output of `python tests/benchmarks/few_groups.py --tables 2000 --seed 20253`.
-Axes of arrays: K comparisons, S seeds, G groups.
+docs/results/verdicts.md has the output. Axes of arrays: K comparisons, S seeds, G groups, R resamples.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import click
 import numpy as np
 
 from memmlp.common.progress import progress_bar
-from memmlp.report.tables.statistics import LEVEL, Error, draw_signs, estimate_error
+from memmlp.report.tables.statistics import LEVEL, estimate_error
 
 GROUPS, SEEDS, COMPARISONS = (8, 9, 14, 30), (2, 5, 10, 20), (1, 12, 112)
 SHAPES = {
@@ -22,10 +21,10 @@ SHAPES = {
 }
 """The person effects: differences with mean 0 and variance 1. Skewed errors of interchangeable variants have
 symmetric differences."""
-SKEWED = "skewed differences"
 SHARES = ((0, 1, 0), (1, 1, 0), (1, 1, 1), (0, 0, 1), (1, 0, 0))
 """The shares of seeds, persons and noise in the variance of the mean."""
 MOST = 0.06  # the largest family-wise error
+RESAMPLES = 4096
 CHUNK = 4000  # comparisons that are drawn at once, which bounds the memory
 
 
@@ -41,39 +40,13 @@ def draw_differences(
     )
 
 
-def is_significant_by_flips(differences: np.ndarray, known: Error, level: float) -> np.ndarray:
-    """Return whether `compute_flip_p` is at most `level`, for each comparison (K,).
-
-    One level needs only the number of flips that exceed a limit. A comparison is out as soon as a part of the
-    flips exceeds it too often, so most comparisons need few flips.
-    """
-    means, signs = differences.mean(1) / differences.shape[2], draw_signs(differences.shape[2])
-    most = int(level * len(signs) * (1 + 1e-9))
-    a, _, e = known.variances
-    half = Error(np.stack([a, 0 * a, 0 * a]), known.seeds, known.groups).compute_half_width(level)
-    total = means.sum(1) ** 2
-    quantiles = [
-        Error(np.array([[1.0], [0], [0]]), freedom, 1).compute_half_width(level)[0] ** 2
-        for freedom in (known.seeds, known.groups)
-    ]
-    limit = total - np.maximum(half**2 - min(quantiles) * e, 0)
-    left = np.flatnonzero((total > half**2) & (limit > 0)) if most else np.array([], int)
-    counts = np.zeros(len(total), int)
-    for part in np.split(signs, [n for n in (256, 2048) if n < len(signs)]):
-        flipped = (means[left] @ part.T) ** 2
-        counts[left] += (flipped >= limit[left, None] * (1 - 1e-9)).sum(1)
-        left = left[counts[left] <= most]
-    return np.isin(np.arange(len(total)), left)
-
-
 def count_claims(
     rng: np.random.Generator, seeds: int, groups: int, tables: int, shape: str, shares: Sequence[float]
-) -> Iterator[tuple[float, float]]:
-    """Yield the family-wise errors of Student's t and of sign flips, for each number of COMPARISONS.
+) -> Iterator[float]:
+    """Yield the family-wise error of p for each number of COMPARISONS.
 
     All nulls are true, so Holm makes a claim exactly if its first step does. Comparisons are independent.
     There are ten times as many tables of one comparison.
-    Tables of one comparison are ten times as many.
     """
     for size in COMPARISONS:
         step, number = max(1, CHUNK // size), 10 * tables if size == 1 else tables
@@ -81,51 +54,94 @@ def count_claims(
         for start in range(0, number, step):
             comparisons = size * min(step, number - start)
             differences = draw_differences(rng, comparisons, seeds, groups, shape, shares)
-            known, level = estimate_error(differences), LEVEL / size
-            student = np.abs(differences.mean((1, 2))) > known.compute_half_width(level)
-            flips = is_significant_by_flips(differences, known, level)
-            claims.append(np.stack([student, flips]).reshape(2, -1, size).any(2))
-        student, flips = np.concatenate(claims, axis=1).mean(1)
-        yield float(student), float(flips)
+            half = estimate_error(differences).compute_half_width(LEVEL / size)
+            claims.append((np.abs(differences.mean((1, 2))) > half).reshape(-1, size).any(1))
+        yield float(np.concatenate(claims).mean())
 
 
-def simulate(groups: int, seeds: int, tables: int, seed: int) -> dict[str, list[float]]:
-    """Return the largest family-wise errors over SHARES for each number of COMPARISONS, by column."""
-    rng = np.random.default_rng([seed, groups, seeds])
-    worst = {name: np.zeros(len(COMPARISONS)) for name in ("t", "flips", SKEWED)}
+def simulate(groups: int, seeds: int, tables: int, seed: int) -> dict[int, tuple[float, str]]:
+    """Return the largest family-wise error, and its cell, for each number of COMPARISONS."""
+    rng, found = np.random.default_rng([seed, groups, seeds]), []
     for shape, shares in itertools.product(SHAPES, SHARES):
-        if shape != "normal" and not shares[1]:
-            continue
-        student, flips = np.array(list(count_claims(rng, seeds, groups, tables, shape, shares))).T
-        column = SKEWED if shape == SKEWED else "flips"
-        worst["t"] = np.maximum(worst["t"], student)
-        worst[column] = np.maximum(worst[column], flips)
-    return {name: errors.tolist() for name, errors in worst.items()}
+        if shape == "normal" or shares[1]:
+            errors = count_claims(rng, seeds, groups, tables, shape, shares)
+            found.append([(error, f"{shape} {shares}") for error in errors])
+    return dict(zip(COMPARISONS, map(max, zip(*found, strict=True)), strict=True))
 
 
-def find_broken(errors: dict[str, list[float]], tables: int) -> bool:
-    """Return whether t, or flips of symmetric differences, exceed MOST by over two standard errors."""
-    limit = MOST + 2 * np.sqrt(MOST * (1 - MOST) / tables)
-    return bool(max(*errors["t"], *errors["flips"]) > limit)
+def find_broken(errors: Iterable[float], tables: int) -> bool:
+    """Return whether a family-wise error exceeds MOST by over two standard errors."""
+    return max(errors) > MOST + 2 * np.sqrt(MOST * (1 - MOST) / tables)
 
 
-def make_row(groups: int, seeds: int, errors: dict[str, list[float]]) -> str:
-    """Return a row of the table, with errors in %."""
-    numbers = [f"{100 * error:.1f}" for column in errors.values() for error in column]
-    return f"| {' | '.join([f'{seeds} x {groups}', *numbers])} |"
+def compute_resampled_p(rng: np.random.Generator, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return p-values (K,) of three resampling tests of the mean 0, for values (K, G), by name.
+
+    Sign flips of the mean; sign flips of Hall's skew-corrected t; and the symmetric bootstrap-t.
+    """
+    groups = values.shape[1]
+    signs = rng.choice([-1.0, 1.0], (RESAMPLES, groups))
+    if 2 ** (groups - 1) <= RESAMPLES:
+        signs = 1.0 - 2 * (np.arange(2 ** (groups - 1))[:, None] >> np.arange(groups) & 1)
+    signs[0] = 1
+    counts = rng.multinomial(groups, np.full(groups, 1 / groups), RESAMPLES).astype(float)
+    mean = values.mean(1, keepdims=True)
+    centred = values - mean
+    means, squares = values @ signs.T / groups, (values**2).mean(1, keepdims=True)
+    cubes = (values**3) @ signs.T / groups - 3 * means * squares + 2 * means**3
+    spread = np.sqrt(squares - means**2)
+    skew, t = cubes / spread**3, means / spread
+    hall = np.abs(t + skew * t**2 / 3 + skew**2 * t**3 / 27 + skew / (6 * groups))
+    drawn = centred @ counts.T / groups
+    variance = np.maximum(centred**2 @ counts.T / groups - drawn**2, 1e-12)
+    larger = np.abs(drawn) / np.sqrt(variance) >= np.abs(mean) / centred.std(1, keepdims=True)
+    return {
+        "flips": (np.abs(means) >= np.abs(mean) * (1 - 1e-9)).mean(1),
+        "flips of skew-corrected t": (hall >= hall[:, :1] * (1 - 1e-9)).mean(1),
+        "bootstrap-t": (larger.sum(1) + 1) / (RESAMPLES + 1),
+    }
+
+
+def simulate_resampling(shape: str, groups: int, comparisons: int, seed: int) -> dict[str, list[float]]:
+    """Return family-wise errors of p and the resampled p-values, for each number of COMPARISONS, by name.
+
+    Only persons differ. One comparison's error gives the errors of independent comparisons.
+    """
+    rng, found = np.random.default_rng([seed, groups]), []
+    for _ in range(0, comparisons, 500):
+        values = draw_differences(rng, 500, 2, groups, shape, (0, 1, 0))
+        known, mean = estimate_error(values), np.abs(values.mean((1, 2)))
+        found.append({"p": known.compute_significance_level(mean), **compute_resampled_p(rng, values[:, 0])})
+    merged = {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+    return {
+        name: [float(1 - (p > LEVEL / size).mean() ** size) for size in COMPARISONS]
+        for name, p in merged.items()
+    }
+
+
+def format_row(head: str, errors: Iterable[float]) -> str:
+    """Return a row of a Markdown table, with errors in %."""
+    return f"| {' | '.join([head, *(f'{100 * error:.1f}' for error in errors)])} |"
 
 
 @click.command()
 @click.option("--tables", default=2000, show_default=True, help="Simulated tables of each cell.")
 @click.option("--seed", default=0, show_default=True, help="Seed of the random numbers.")
-def main(tables: int, seed: int) -> None:
-    """Print the table of docs/results/verdicts.md for few groups; exit with 1 if a promise is broken."""
-    heads = [f"{name}, {size}" for name in ("t", "flips", "flips, skewed") for size in COMPARISONS]
-    click.echo(f"| seeds x groups | {' | '.join(heads)} |\n|{' ---: |' * (len(heads) + 1)}")
+@click.option(
+    "--resampling", is_flag=True, help="Compare with resampled p-values, in 10 x TABLES comparisons."
+)
+def main(tables: int, seed: int, resampling: bool) -> None:
+    """Print a table of docs/results/verdicts.md for few groups; exit with 1 if a promise is broken."""
+    if resampling:
+        for shape, groups in itertools.product(("skewed differences", "normal"), (8, 14, 30)):
+            for name, errors in simulate_resampling(shape, groups, 10 * tables, seed).items():
+                click.echo(format_row(f"{shape} | {groups} | {name}", errors))
+        return
     broken = False
     for groups, seeds in progress_bar(list(itertools.product(GROUPS, SEEDS)), "simulating"):
-        errors = simulate(groups, seeds, tables, seed)
-        click.echo(make_row(groups, seeds, errors))
+        errors, cells = zip(*simulate(groups, seeds, tables, seed).values(), strict=True)
+        click.echo(format_row(f"{seeds} x {groups}", errors))
+        click.echo(f"  {'; '.join(cells)}", err=True)
         broken |= find_broken(errors, tables)
     raise SystemExit(broken)
 

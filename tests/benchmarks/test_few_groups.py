@@ -1,27 +1,17 @@
-"""The simulation of few groups decides as the p-values do, from differences of variance 1."""
+"""Simulated differences have variance 1; p keeps its level, and resampling tests do not."""
 
 import numpy as np
 import pytest
 from benchmarks.few_groups import (
     SHAPES,
     SHARES,
+    compute_resampled_p,
     draw_differences,
     find_broken,
-    is_significant_by_flips,
     simulate,
+    simulate_resampling,
 )
-
-from memmlp.report.tables.statistics import compute_flip_p, estimate_error
-
-
-@pytest.mark.parametrize(("groups", "seeds"), [(8, 2), (9, 20), (14, 5), (24, 3)])
-def test_a_level_decides_as_the_p_value(groups: int, seeds: int):
-    drawn = draw_differences(np.random.default_rng(1), 100, seeds, groups, "heavy tails", (1, 1, 1))
-    drawn[::2] += 2
-    p, known = compute_flip_p(drawn), estimate_error(drawn)
-    for level in (0.05, 0.05 / 12):
-        np.testing.assert_array_equal(is_significant_by_flips(drawn, known, level), p <= level)
-    assert (p <= 0.05).any()
+from scipy import stats
 
 
 def test_means_have_a_variance_of_one():
@@ -31,8 +21,17 @@ def test_means_have_a_variance_of_one():
             assert drawn.mean((1, 2)).var() == pytest.approx(1, abs=0.1), (shape, shares)
 
 
-def test_false_claims_of_skewed_differences_are_counted_apart():
-    errors = simulate(9, 5, 200, 0)
-    assert not find_broken(errors, 200)
-    assert errors["skewed differences"][1] > 0.1
-    assert find_broken({**errors, "flips": [0.2]}, 200)
+def test_flips_are_the_exact_test_and_the_bootstrap_is_near_students():
+    sample = np.random.default_rng(4).normal(0.5, 1, 9)
+    p = compute_resampled_p(np.random.default_rng(0), sample[None])
+    known = stats.permutation_test((sample,), np.mean, permutation_type="samples", n_resamples=np.inf)
+    assert p["flips"][0] == pytest.approx(known.pvalue)
+    for name in ("flips of skew-corrected t", "bootstrap-t"):
+        assert p[name][0] == pytest.approx(stats.ttest_1samp(sample, 0).pvalue, abs=0.05)
+
+
+def test_p_keeps_its_level_and_resampling_does_not():
+    assert not find_broken([error for error, _ in simulate(9, 5, 200, 0).values()], 200)
+    errors = simulate_resampling("skewed differences", 14, 1000, 0)
+    assert find_broken(errors.pop("flips"), 1000)
+    assert not find_broken(errors.pop("p")[:1], 1000)

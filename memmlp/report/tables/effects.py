@@ -16,7 +16,6 @@ from memmlp.report.tables.measured_run import SHARED_METRIC, MeasuredRun, select
 from memmlp.report.tables.statistics import (
     compute_detectable,
     compute_equivalence_p,
-    compute_flip_p,
     correct_by_holm,
     count_needed_seeds,
     decide_verdict,
@@ -215,7 +214,7 @@ def estimate_effects(
     Args:
         pairs: the differences.
         smallest: the smallest effect of interest by metric.
-        sensitivity: whether to compute detectable effects and sign-flip p-values, which doubles the time.
+        sensitivity: whether to compute detectable effects, which doubles the time.
     """
     found: dict[Key, Effect] = {}
     comparisons = max(1, count_testable(pairs))
@@ -230,12 +229,11 @@ def estimate_effects(
         same = compute_equivalence_p(differences, margins, groups)
         nothing = np.full(len(keys), np.nan)
         seen = compute_detectable(differences, comparisons, groups) if sensitivity else nothing
-        flips = compute_flip_p(differences, groups) if sensitivity else nothing
         numbers = estimate_paired_effects(differences, groups)
-        columns = zip(keys, *numbers[:4], same, seen, flips, strict=True)
-        for key, mean, low, high, p, equal, least, flip in columns:
+        columns = zip(keys, *numbers[:4], same, seen, strict=True)
+        for key, mean, low, high, p, equal, least in columns:
             values, tested = {"low": low, "high": high}, {"p": p, "equal": equal, "detectable": least}
-            values |= {**tested, "flips": flip} if pairs[key].is_testable else {}
+            values |= tested if pairs[key].is_testable else {}
             known: dict[str, Any] = {name: convert_nan_to_none(number) for name, number in values.items()}
             found[key] = Effect(float(mean), **known, **size)
     return {key: found[key] for key in pairs}
@@ -306,17 +304,17 @@ def _add_verdicts(
 ) -> dict[Key, Effect]:
     """Return the effects with verdicts and corrected p-values.
 
-    Holm's correction treats differences, equivalences and sign flips as separate families of p-values.
+    Holm's correction treats differences and equivalences as separate families of p-values.
     """
     keys = list(tested)
     families = (
         correct_by_holm(np.array([convert_none_to_nan(getattr(tested[key], name)) for key in keys]))
-        for name in ("p", "equal", "flips")
+        for name in ("p", "equal")
     )
     judged = {}
-    for key, p, q, flips in zip(keys, *families, strict=True):
+    for key, p, q in zip(keys, *families, strict=True):
         verdict = decide_verdict(float(p), float(q), tested[key].mean, printed.get(key))
-        corrected = {"holm": p, "equal": q, "flips": flips}
+        corrected = {"holm": p, "equal": q}
         numbers: dict[str, Any] = {name: convert_nan_to_none(one) for name, one in corrected.items()}
         judged[key] = replace(tested[key], **numbers, verdict=verdict)
     return judged

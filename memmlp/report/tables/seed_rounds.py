@@ -175,14 +175,13 @@ class Rounds:
             if not effect.verdict:
                 continue
             if key not in latest:
-                found[key] = replace(effect, holm=None, equal=None, flips=None, verdict=Verdict.INCONCLUSIVE)
+                found[key] = replace(effect, holm=None, equal=None, verdict=Verdict.INCONCLUSIVE)
                 continue
             finding, analysis = latest[key]
             found[key] = replace(
                 effect,
                 holm=finding.holm,
                 equal=finding.equal,
-                flips=None,
                 verdict=finding.verdict,
                 level=analysis.level,
                 decided=None if finding.verdict is Verdict.INCONCLUSIVE else analysis.seeds,

@@ -33,8 +33,6 @@ from scipy.special import chdtri, ndtri, stdtr, stdtrit
 
 LEVEL = 0.05
 DRAWS = 4096  # number of simulated tables; Sobol's sequence needs a power of two
-FEW_GROUPS = 30  # maximum number of clip groups with sign-flip p-values
-MAX_FLIPS = 2**14  # number of sign flips; with at most 15 groups, these are all flips
 
 Groups = np.ndarray | Sequence[object] | None
 """The group of each clip (C,), as integers or labels; None if each clip forms a separate group."""
@@ -242,49 +240,6 @@ def compute_equivalence_p(
     if known.unreplicated:
         return np.full(len(differences), np.nan)
     return known.compute_significance_level(margin - np.abs(differences.mean((1, 2))))
-
-
-def compute_flip_p(differences: np.ndarray, groups: Groups = None) -> np.ndarray:
-    """Return p-values (K,) of sign flips, from differences (K, S, C) and groups (C,).
-
-    The group side of the interval is the distribution of the mean under sign flips of the group means. The
-    seed side is Student's, and the sides add as in `Error.compute_half_width`. The null hypothesis is that
-    variant and control are interchangeable in each group, so differences are symmetric around 0. The group
-    side is then exact with few groups and heavy tails. It is too small if differences are skewed.
-
-    The smallest possible p-value is 1 / the number of flips. P-values are NaN with a single seed or group, or
-    with more than FEW_GROUPS groups.
-    """
-    known = estimate_error(differences, groups)
-    means, weights = average_groups(differences, groups)
-    if known.unreplicated or len(weights) > FEW_GROUPS:
-        return np.full(len(differences), np.nan)
-    signs = draw_signs(len(weights))
-    levels = np.arange(1, len(signs) + 1) / len(signs)
-    seeds, noise = _square_quantile(known.seeds, levels), _square_quantile(known.groups, levels)
-    noise, found = np.minimum(seeds, noise), []
-    for parts, (a, _, e) in zip(means.mean(1) * weights, known.variances.T, strict=True):
-        flipped = np.sort((signs @ parts) ** 2)[::-1]
-        b = np.append(flipped[1:], 0)  # at level k / N, k flips may be at least as large as the mean
-        half = np.maximum(np.maximum(a * seeds, b), a * seeds + b - noise * e)
-        significant = parts.sum() ** 2 > half * (1 + 1e-9)  # equal flips differ by rounding
-        found.append(levels[significant.argmax()] if significant.any() else 1.0)
-    return np.where(np.isfinite(known.variances.sum(0)), found, np.nan)
-
-
-@functools.cache
-def draw_signs(groups: int) -> np.ndarray:
-    """Return sign vectors (N, G); the first has no minus.
-
-    These are all sign vectors without their negatives, or MAX_FLIPS random ones. With the observed one among
-    random ones, the test is valid for any number of them (Phipson & Smyth 2010).
-    """
-    if 2 ** (groups - 1) <= MAX_FLIPS:
-        bits = np.arange(2 ** (groups - 1))[:, None] >> np.arange(groups) & 1
-    else:
-        bits = np.random.default_rng(0).integers(0, 2, (MAX_FLIPS, groups))
-        bits[0] = 0
-    return 1.0 - 2 * bits
 
 
 def compute_detectable(

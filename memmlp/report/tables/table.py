@@ -35,7 +35,6 @@ class Effect:
         p: its p-value, not corrected.
         holm: its p-value, corrected for all comparisons in the table.
         equal: the corrected p-value of equivalence (see `memmlp.report.tables.statistics`).
-        flips: the corrected p-value of sign flips, which does not decide the verdict; None with many groups.
         verdict: the verdict.
         detectable: the smallest difference that this comparison detects with 80 % power.
         seeds, clips, groups: the numbers of paired seeds, clips and clip groups.
@@ -50,7 +49,6 @@ class Effect:
     p: float | None = None
     holm: float | None = None
     equal: float | None = None
-    flips: float | None = None
     verdict: Verdict | None = None
     detectable: float | None = None
     seeds: int = 0
@@ -64,11 +62,6 @@ class Effect:
     def is_significant(self) -> bool:
         """Whether the difference is significant after the correction."""
         return self.holm is not None and self.holm < self.level
-
-    @property
-    def is_decided_by_flips(self) -> bool:
-        """Whether the verdict is inconclusive, and sign flips are significant after the correction."""
-        return self.verdict is Verdict.INCONCLUSIVE and self.flips is not None and self.flips <= self.level
 
 
 @dataclass(frozen=True)

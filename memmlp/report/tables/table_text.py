@@ -21,6 +21,7 @@ from memmlp.report.tables.table import MAX_TIME_RATIO, Cell, Effect, Row, Table
 from memmlp.sweep.definition import COSTS
 
 COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB"}
+FEW_GROUPS = 30  # maximum number of clip groups at which p-values are printed
 MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
 CONFOUNDED = "‡"  # mark of a row that differs from its control in more than its label names
@@ -109,7 +110,7 @@ def make_legend(table: Table) -> list[str]:
                 f"{', '.join(parts)} seeds, which share the 5 %; (3): decided at 3 seeds, and final; means "
                 "and intervals use all seeds"
             )
-        lines += [*_explain_branches(table), *_explain_flips(table)]
+        lines += _explain_branches(table)
         lines += [f"{mode} mode: {text}" for mode in table.modes if (text := describe_power(table, mode))]
     if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
         lines.append(_summarize_agreement(table))
@@ -179,18 +180,6 @@ def _explain_branches(table: Table) -> list[str]:
         every = len(rows) == sum(row.against is not None for row in table.rows)
         lines.append(f"{branch} not recorded: {'every comparison' if every else join_quoted(rows)}")
     return lines
-
-
-def _explain_flips(table: Table) -> list[str]:
-    effects = [effect for mode in table.modes for *_, effect in table.list_effects(mode)]
-    if all(effect.flips is None for effect in effects):
-        return []
-    more = sum(effect.is_decided_by_flips for effect in effects)
-    return [
-        "p, flips: corrected p-values of Student's t for skewed groups, which decides the verdict, and of "
-        "sign flips, which assume symmetric differences; "
-        f"flips alone would decide {more} inconclusive comparisons"
-    ]
 
 
 def describe_power(table: Table, mode: str) -> str:
@@ -307,9 +296,9 @@ def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
     star = "*" if effect.is_significant else ""
     at = f" ({effect.decided})" if effect.decided else ""
     verdict = () if effect.verdict is None else (f"{effect.verdict}{at}",)
-    numbers = {"p": effect.holm, "flips": effect.flips} if effect.flips is not None else {}
-    both = [f"{name} {format_significant(p, 2)}" for name, p in numbers.items() if p is not None]
-    return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict, *both
+    known = effect.holm is not None and 0 < effect.groups <= FEW_GROUPS
+    p = (f"p {format_significant(effect.holm, 2)}",) if known else ()
+    return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict, *p
 
 
 def format_branch_effect(effect: Effect | None, cell: Cell) -> tuple[str, ...]:
@@ -414,7 +403,7 @@ def to_json(table: Table) -> str:
 CSV_HEADINGS = (
     "test clips", "variant", "mode", "branch", "metric", "unit", "seeds", "planned seeds", "clips", "mean",
     "sd", "low", "high", "compared with", "difference", "difference low", "difference high", "p",
-    "corrected p", "equivalence p", "sign-flip p", "verdict", "decided at seeds", "detectable", "paper",
+    "corrected p", "equivalence p", "verdict", "decided at seeds", "detectable", "paper",
     "paper difference", "confounded",
 )  # fmt: skip
 
@@ -455,7 +444,7 @@ def _list_numbers(table: Table, row: Row) -> Iterator[list[object]]:
 def _make_csv_line(
     row: Row, head: Sequence[str], numbers: Sequence[object], effect: Effect | None, cell: Cell | None = None
 ) -> list[object]:
-    names = ("mean", "low", "high", "p", "holm", "equal", "flips", "verdict", "decided", "detectable")
+    names = ("mean", "low", "high", "p", "holm", "equal", "verdict", "decided", "detectable")
     line = [row.label, *head, find_unit(head[-1]), *numbers, row.against if effect else ""]
     line += [getattr(effect, name) if effect else "" for name in names]
     line += [cell.paper, cell.paper_effect] if cell else ["", ""]

@@ -1,7 +1,5 @@
 """Statistics of paired differences: intervals, p-values, power, verdicts, and what they promise."""
 
-import itertools
-
 import numpy as np
 import pytest
 from drawn import SHARES, TABLE, differences, groups, starred
@@ -14,7 +12,6 @@ from memmlp.report.tables.statistics import (
     Verdict,
     compute_detectable,
     compute_equivalence_p,
-    compute_flip_p,
     correct_by_holm,
     correct_sequentially,
     count_needed_seeds,
@@ -51,35 +48,6 @@ def test_clips_or_seeds_that_do_not_differ_leave_students_test_of_the_others():
     effects = estimate_paired_effects(np.repeat(sample[None, None], 3, 1))
     t = sample.mean() / stats.sem(sample)
     assert effects.p[0] == pytest.approx(2 * stats.t.sf(t, 0.9 * 11**0.6), rel=1e-6)
-
-
-def test_equal_seeds_leave_the_exact_sign_flip_test():
-    sample = np.random.default_rng(4).normal(0.5, 1, 9)
-    flipped = [abs(sample @ signs) for signs in itertools.product((1, -1), repeat=9)]
-    expected = np.mean(np.array(flipped) >= abs(sample.sum()) - 1e-9)
-    assert compute_flip_p(np.repeat(sample[None, None], 3, 1))[0] == pytest.approx(expected)
-    assert compute_flip_p(np.ones((1, 3, 9)))[0] == 1 / 2**8
-    signs = scipy_flips(np.random.default_rng(5).normal(0.4, 1, 24))
-    assert signs[0] == pytest.approx(signs[1], abs=0.01)
-
-
-def scipy_flips(sample: np.ndarray) -> tuple[float, float]:
-    """Return the p-values of random sign flips of this project and of scipy."""
-    known = stats.permutation_test(
-        (sample,), np.mean, permutation_type="samples", n_resamples=20000, rng=np.random.default_rng(0)
-    )
-    return compute_flip_p(np.repeat(sample[None, None], 2, 1))[0], known.pvalue
-
-
-def test_sign_flips_add_the_seeds_side():
-    """Seeds that vary as much as groups widen the test, and 31 groups are not few."""
-    rng = np.random.default_rng(6)
-    of_groups = rng.normal(0.8, 1, (1, 1, 12))
-    of_seeds = np.array([-0.4, 0.1, 0.3])[None, :, None]
-    p = [compute_flip_p(of_groups + scale * of_seeds)[0] for scale in (0, 1, 3)]
-    assert p[0] < p[1] < p[2]
-    assert np.isnan(compute_flip_p(rng.normal(size=(2, 3, 31)))).all()
-    assert np.isnan(compute_flip_p(rng.normal(size=(2, 1, 9)))).all()
 
 
 def test_equal_groups_are_the_analysis_of_their_means():

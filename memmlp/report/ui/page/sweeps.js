@@ -135,9 +135,6 @@ function frontiers(found) {
     table(['variant', ...COSTS.map(([, head]) => head)], found.rows.filter(row => row.found.length).map(row => [row.label, ...COSTS.map(([cost]) => digits(row.costs[cost]))])));
 }
 
-// Both corrected p-values, where sign flips were computed.
-const bothP = ({ holm, flips }) => ((flips ?? null) === null || holm === null ? '' : `p ${number(Number(holm.toPrecision(2)))}, flips ${number(Number(flips.toPrecision(2)))}`);
-
 const significant = effect => Boolean(effect) && effect.holm !== null && effect.holm < effect.level;
 
 // Seeds spent in rounds: what each interim analysis decided, and the progress of each variant.
@@ -169,7 +166,7 @@ function cell({ mean, sd, effect, paper, paper_effect: paperEffect, counted, cli
     h('span', { class: 'strong' }, mean === null ? DASH : metricNumber(metric, mean), sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(sd, mean >= 1000 ? 0 : decimals(mean))}`), counted < clips ? h('small', { class: 'faint' }, ` (${counted} of ${clips} clips)`) : null),
     effect && h('span', { class: significant(effect) ? 'strong' : '' }, signed(effect.mean, digits), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`)),
     effect?.verdict && [h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null,
-      bothP(effect) ? h('small', { class: 'faint' }, ` ${bothP(effect)}`) : null],
+      effect.holm === null || !(effect.groups <= 30) ? null : h('small', { class: 'faint' }, ` p ${number(Number(effect.holm.toPrecision(2)))}`)],
     paper !== null && h('small', { class: 'faint' }, `paper ${number(paper)}`, paperEffect === null ? null : ` (${signed(paperEffect)})`),
   ];
 }
