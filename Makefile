@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test test-fast coverage mutants golden check docs dist pre-commit clean
+.PHONY: setup demo test test-fast test-slurm coverage mutants golden check docs dist pre-commit clean
 
 setup: $(STAMP)
 
@@ -28,6 +28,10 @@ test: $(STAMP)
 
 test-fast: $(STAMP)
 	$(PYTEST) -m "not slow"
+
+# A real Slurm of one node in a temporary folder, where Debian's slurm-wlm and munge are installed; ten minutes.
+test-slurm: $(STAMP)
+	MEMMLP_SLURM=1 $(BIN)/python -m pytest -rs -s tests/sweep/executors/test_real_slurm.py
 
 coverage: $(STAMP)
 	$(PYTEST) --cov --cov-report=term:skip-covered

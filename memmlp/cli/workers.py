@@ -12,7 +12,7 @@ from uuid import uuid4
 
 import click
 
-from memmlp.common.errors import InputError, import_optional
+from memmlp.common.errors import InputError
 from memmlp.common.overrides import Override
 from memmlp.common.processes import count_usable_cores
 
@@ -52,7 +52,6 @@ class Workers:
     def parse_options(self) -> Any:
         """Parse and check the executor's settings. Raises InputError for a wrong setting."""
         if self.executor == "slurm":
-            import_optional("submitit", "slurm", "executor=slurm")
             from memmlp.sweep.executors.slurm import parse_slurm_options
 
             return parse_slurm_options(self.settings)

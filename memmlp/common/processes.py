@@ -31,7 +31,8 @@ def collect_garbage_rarely() -> None:
 def count_usable_cores() -> int:
     """Return the number of cores that this process may use: affinity, cgroup quota, Slurm's allocation."""
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    # Slurm sets the number per task only if it was requested.
+    slurm = os.environ.get("SLURM_CPUS_PER_TASK") or os.environ.get("SLURM_CPUS_ON_NODE", "")
     limits = [float(affinity), *_read_cgroup_quotas(), *([float(slurm)] if slurm.isdecimal() else [])]
     return max(math.ceil(min(limits)), 1)
 
@@ -97,21 +98,6 @@ def build_import_variables() -> dict[str, str]:
         and os.path.basename(path) != zipped
     ]
     return {"PYTHONPATH": os.pathsep.join(given), "PYTHONSAFEPATH": "1"}
-
-
-@contextlib.contextmanager
-def pass_import_paths_to_children() -> Iterator[None]:
-    """Set `build_import_variables` in this process during the context, so that child processes inherit it."""
-    before = {name: os.environ.get(name) for name in build_import_variables()}
-    os.environ.update(build_import_variables())
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 class CoreUsageTimer:

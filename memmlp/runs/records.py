@@ -131,6 +131,16 @@ Deployment = _record(
 LogEntry = _complete_record(step=int, phase=str, values=dict[str, Number], time=float)
 Tree = dict[str, Any]  # results.json
 
+# search.json: a search, and the command line that began it
+SearchRecord = _record(
+    _complete_record(
+        name=str, base=list[str], space=list[_complete_record(key=str)],  # type: ignore[misc]
+        objectives=Annotated[list[_complete_record(text=str)], len],  # type: ignore[misc]
+        n_trials=int, tflop=float | None, storage=str | None,
+    ),
+    command_line=list[str],
+)  # fmt: skip
+
 
 def read(path: Path, kind: Any) -> dict[str, Any]:
     """Return the record in a file; empty if the file is missing or damaged (see `find_damage`)."""

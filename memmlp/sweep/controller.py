@@ -14,6 +14,7 @@ from memmlp.sweep.worker import Presence
 READ_INTERVAL = 0.5  # seconds between two reads of the run folders
 MIN_LIFETIME = 20.0  # seconds; a worker that ends sooner has failed to start
 MAX_FAILED_STARTS = 5  # the maximum number of failed starts in a row, per worker of the fleet
+SUBMIT_PAUSE = 10.0  # seconds after a replacement could not be submitted; a cluster may restart meanwhile
 
 
 class Fleet:
@@ -40,12 +41,14 @@ class Fleet:
         self.handles: list[tuple[Handle, float]] = []
         self.failed_starts = 0
         self.complaint: str | None = None
+        self.next_start: float | None = None  # None before the first start
 
     def keep_workers_running(self, count: int) -> None:
         """Start workers until `count` are running; the fleet's size is the maximum.
 
         Raises:
-            InputError: if too many workers in a row end soon after their start.
+            InputError: if the first workers cannot be started, or too many in a row end soon after their
+                start while no other works.
         """
         now = time.monotonic()
         living = []
@@ -58,11 +61,24 @@ class Fleet:
             quick = complaint is not None or now - started < MIN_LIFETIME
             self.failed_starts = self.failed_starts + 1 if quick else 0
         self.handles = living
-        if self.failed_starts >= MAX_FAILED_STARTS * self.size:
+        working = any(now - started >= MIN_LIFETIME for _, started in living)
+        if self.failed_starts >= MAX_FAILED_STARTS * self.size and not working:
             reason = self.complaint or "the reason"
             raise InputError(f"workers end as soon as they are started: {reason}; see {self.logs}")
-        if (missing := min(count, self.size) - len(self.handles)) > 0:
-            self.handles += [(handle, now) for handle in self.executor.submit(self.work, missing)]
+        missing = min(count, self.size) - len(self.handles)
+        if missing > 0 and now >= (self.next_start or 0.0):
+            self._start(missing)
+
+    def _start(self, count: int) -> None:
+        now = time.monotonic()
+        try:
+            self.handles += [(handle, now) for handle in self.executor.submit(self.work, count)]
+            self.next_start = now
+        except InputError as error:
+            if self.next_start is None:
+                raise
+            self.complaint, self.next_start = str(error), now + SUBMIT_PAUSE
+            self.failed_starts += count
 
     def cancel(self) -> None:
         """End all workers."""

@@ -50,11 +50,12 @@ KEYS = (
     "variants", "axes",
 )  # fmt: skip
 VARIANT_KEYS = ("overrides", "branch", "against", "paper", "note", "confounded")
+MAX_NAME_BYTES = 200  # of a sweep file's stem; folders have longer names
 BASE = "base"  # the variant's label in a sweep without variants and grids
 
 
 def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: None) -> Sweep:
-    """Read a sweep file.
+    """Read a sweep file. Its stem names the sweep's folder.
 
     Args:
         path: the file.
@@ -63,6 +64,12 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
     Raises:
         InputError: for invalid content; the message names the file and the key.
     """
+    name = path.stem
+    if not name.isprintable() or not name.strip(". ") or len(name.encode()) > MAX_NAME_BYTES:
+        raise InputError(
+            f"{path.parent}: the name {name!r} must be printable, have other characters than dots, and be at "
+            f"most {MAX_NAME_BYTES} bytes long; rename the sweep file"
+        )
     try:
         content = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -72,7 +79,7 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
     try:
         base = content.get("base") if isinstance(content, Mapping) else None
         prepare([text for text in base if isinstance(text, str)] if isinstance(base, list) else [])
-        return parse_sweep(path.stem, content)
+        return parse_sweep(name, content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

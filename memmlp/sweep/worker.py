@@ -7,6 +7,7 @@ continues the run from the last checkpoint. `config/worker_process.py` performs 
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 import traceback
@@ -97,7 +98,10 @@ def _finish_run(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
         perform(plan, task)
     except Cancelled:
         pass
-    except LeaseLost:
+    except KeyboardInterrupt:
+        run.reset_deaths()  # a scheduler may interrupt a run any number of times
+        raise
+    except (LeaseLost, BrokenPipeError):  # whoever read the worker's output has died
         raise
     except (InputError, TrainingDiverged) as error:
         run.fail(str(error))
@@ -108,16 +112,15 @@ def _finish_run(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
 
 
 def count_deaths(run: Run) -> int:
-    """Count the latest processes in a row that started the run at its current step.
+    """Count the latest processes in a row that started the same stage of the run at its current step.
 
-    Processes before successful work, or before the last --retry, are not counted.
+    Processes before successful work, before an interruption, or before the last --retry, are not counted.
     """
-    step, count, manifest = run.step, 0, run.manifest
-    for start in reversed(manifest.get("attempts", [])[manifest.get("forgiven", 0) :]):
-        if start.get("step") != step:
-            break
-        count += 1
-    return count
+    manifest = run.manifest
+    starts = manifest.get("attempts", [])[manifest.get("forgiven", 0) :]
+    last = (run.step, starts[-1].get("stage") if starts else None)
+    same = itertools.takewhile(lambda one: (one.get("step"), one.get("stage")) == last, reversed(starts))
+    return sum(1 for _ in same)
 
 
 class Presence:

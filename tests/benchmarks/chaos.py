@@ -1,6 +1,7 @@
 """Kill a sweep's and a search's processes at random; the results must be those of undisturbed ones.
 
     python tests/benchmarks/chaos.py --runs 12 --kills 20
+    python tests/benchmarks/chaos.py --during export --kills 40 --trials 0
 
 Exits with 1 where they differ. tests/kills runs the same with a few kills.
 """
@@ -35,6 +36,14 @@ SEARCH_SHARE = 0.25  # of all kills
 PATIENCE = 60.0  # seconds for the last workers to release their runs
 ENDS = ("complete", "pruned")  # the ends of trials whose runs can't fail
 
+MOMENTS: dict[str, Callable[[Run], bool]] = {
+    "anything": lambda run: True,
+    "checkpoints": lambda run: run.checkpoint.exists() and not run.done,
+    "evaluation": lambda run: run.activity == "evaluating",
+    "export": lambda run: run.activity == "exporting",
+}
+"""When a run's process may be killed."""
+
 Launch = Callable[[], subprocess.Popen[bytes]]
 
 
@@ -43,9 +52,17 @@ Launch = Callable[[], subprocess.Popen[bytes]]
 @click.option("--kills", default=20, show_default=True, help="How often a process is killed (SIGKILL).")
 @click.option("--controllers", default=3, show_default=True, help="How many controllers work at once.")
 @click.option("--trials", default=10, show_default=True, help="Trials of the search; 0 for no search.")
+@click.option(
+    "--during",
+    type=click.Choice(list(MOMENTS)),
+    default="anything",
+    help="Kill workers of a sweep only then.",
+)
 @click.option("--seed", default=0, show_default=True, help="Seed of the choice of victims and pauses.")
 @click.argument("overrides", nargs=-1)
-def main(runs: int, kills: int, controllers: int, trials: int, seed: int, overrides: tuple[str, ...]) -> None:
+def main(
+    runs: int, kills: int, controllers: int, trials: int, during: str, seed: int, overrides: tuple[str, ...]
+) -> None:
     """Run a sweep, then a search, under random SIGKILLs.
 
     Every run must be finished exactly once, with bit-identical weights. The search must end with exactly the
@@ -53,7 +70,7 @@ def main(runs: int, kills: int, controllers: int, trials: int, seed: int, overri
     """
     of_search = round(SEARCH_SHARE * kills) if trials else 0
     dice = random.Random(seed)
-    problems = sweep_storm(runs, kills - of_search, controllers, dice, overrides)
+    problems = sweep_storm(runs, kills - of_search, controllers, dice, overrides, during)
     if trials:
         problems += search_storm(trials, of_search, controllers, dice, overrides)
     click.echo("\n".join([*problems, f"{kills} kills: {len(problems)} differences"]))
@@ -61,7 +78,12 @@ def main(runs: int, kills: int, controllers: int, trials: int, seed: int, overri
 
 
 def sweep_storm(
-    runs: int, kills: int, controllers: int, dice: random.Random, overrides: Sequence[str]
+    runs: int,
+    kills: int,
+    controllers: int,
+    dice: random.Random,
+    overrides: Sequence[str],
+    during: str = "anything",
 ) -> list[str]:
     """Run a sweep of two variants under kills, and list how it differs from an undisturbed one."""
     with tempfile.TemporaryDirectory() as folder:
@@ -71,7 +93,8 @@ def sweep_storm(
         arguments = ["sweep", str(sweep), *OVERRIDES, *overrides]
         calm, stormy = Path(folder) / "calm", Path(folder) / "stormy"
         assert start(arguments, calm, workers=2).wait() == 0, "the undisturbed sweep failed"
-        storm([partial(start, arguments, stormy, workers=1)] * controllers, stormy, kills, PAUSES, dice)
+        launches = [partial(start, arguments, stormy, workers=1)] * controllers
+        storm(launches, stormy, kills, PAUSES, dice, during)
         return compare(calm, stormy)
 
 
@@ -98,7 +121,12 @@ def start(arguments: Sequence[str], outputs: Path, workers: int) -> subprocess.P
 
 
 def storm(
-    launches: Sequence[Launch], outputs: Path, kills: int, pauses: tuple[float, float], dice: random.Random
+    launches: Sequence[Launch],
+    outputs: Path,
+    kills: int,
+    pauses: tuple[float, float],
+    dice: random.Random,
+    during: str = "anything",
 ) -> None:
     """Keep the processes running until all have succeeded, and kill random ones meanwhile.
 
@@ -106,14 +134,19 @@ def storm(
     kill, the next pause is half as long.
     """
     processes = [launch() for launch in launches]
-    killed, factor = 0, 1.0
+    killed, factor, counts = 0, 1.0, Counter[Path]()
     while killed < kills or any(process.poll() != 0 for process in processes):
         time.sleep(factor * dice.uniform(*pauses))
         if killed < kills:
-            victim = choose(processes, outputs, dice)
-            factor = factor / 2 if victim is None else 1.0
-            if victim is not None:
+            victims = list_victims(processes, outputs, during)
+            least = [
+                victim for victim in victims if counts[victim[0]] == min(counts[one] for one, _ in victims)
+            ]
+            factor = 1.0 if victims else factor / 2
+            if victims:  # a run that dies ten times in a row at one place would count as failed
+                folder, victim = dice.choice(least)
                 os.kill(victim, signal.SIGKILL)
+                counts[folder] += 1
                 killed += 1
         for index, launch in enumerate(launches):
             code = processes[index].poll()
@@ -124,12 +157,16 @@ def storm(
         time.sleep(0.1)
 
 
-def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: random.Random) -> int | None:
-    """Choose a process to kill: a controller, or a worker that holds a run; None without one."""
-    owners = [Lock(folder).owner for folder in sorted(outputs.glob("runs/*/"))]
-    workers = [int(owner["pid"]) for owner in owners if owner and is_alive(owner)]
-    victims = [*(process.pid for process in processes if process.poll() is None), *workers]
-    return dice.choice(victims) if victims else None
+def list_victims(
+    processes: Sequence[subprocess.Popen[bytes]], outputs: Path, during: str
+) -> list[tuple[Path, int]]:
+    """List processes to kill: workers that hold a run at that moment, else also controllers."""
+    runs = [Run(folder) for folder in sorted(outputs.glob("runs/*/"))]
+    owners = [(run.folder, Lock(run.folder).owner) for run in runs if MOMENTS[during](run)]
+    workers = [(folder, int(owner["pid"])) for folder, owner in owners if owner and is_alive(owner)]
+    if during != "anything":
+        return workers
+    return [*((outputs, process.pid) for process in processes if process.poll() is None), *workers]
 
 
 def compare(calm: Path, stormy: Path) -> list[str]:

@@ -71,6 +71,17 @@ def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypa
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("during", ["checkpoints", "evaluation", "export"])
+def test_a_sweep_whose_workers_are_killed_in_one_stage_ends_as_an_undisturbed_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, during: str
+):
+    fork_controllers(tmp_path, monkeypatch, "executor=debug")
+    monkeypatch.setattr(chaos, "PAUSES", (0.05, 0.3))
+    words = [*SMALL, "evaluation.modes=[stream]", "optim.checkpoint_every=5"]
+    assert chaos.sweep_storm(2, 2, 1, random.Random(0), words, during) == []
+
+
+@pytest.mark.slow
 def test_a_search_under_kills_has_every_trial_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fork_controllers(tmp_path, monkeypatch, "--workers", "1")
     assert chaos.search_storm(2, 1, 1, random.Random(0), SMALL) == []

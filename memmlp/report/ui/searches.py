@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import read_json
+from memmlp.runs import records
+from memmlp.runs.records import SearchRecord
 
 if TYPE_CHECKING:
     import optuna
     from optuna.trial import FrozenTrial
+
+SQLITE = "sqlite:///"
 
 
 class Searches:
@@ -78,11 +81,15 @@ def _describe_search(folder: Path) -> dict[str, Any]:
 
     from memmlp.sweep.search.study import open_storage
 
-    spec = read_json(folder / "search.json")
-    title = str(spec.get("name") or folder.name)
+    spec = records.read(folder / "search.json", SearchRecord)
+    damage = records.find_damage(folder / "search.json", SearchRecord)
+    title = spec.get("name") or folder.name
     about = {"name": folder.name, "title": title, "wanted": spec.get("n_trials")}
+    url = str(spec.get("storage") or "")
+    if damage or (url.startswith(SQLITE) and not Path(url.removeprefix(SQLITE)).is_file()):
+        return {**about, "error": damage or "has not started"}  # opening would make the file
     try:
-        storage = open_storage(spec.get("storage"), folder)
+        storage = open_storage(url or None, folder)
         return about | _describe_study(optuna.load_study(storage=storage, study_name=folder.name))
     except KeyError:
         return {**about, "error": "has not started"}

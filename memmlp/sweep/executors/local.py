@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import pickle
 import subprocess
 import sys
 import threading
+import time
 import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,6 +26,8 @@ from memmlp.sweep.executors import Work
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 WORK, LINE = "work.pickle", "line.txt"  # files of a worker's folder: the pickled work, and the returned line
+LOG, HEARTBEAT = "log.txt", "heartbeat"  # further files: the worker's output; touched every BEAT if requested
+BEAT = 5.0  # seconds
 
 GpuGroup = tuple[str, ...]
 """The names, as in CUDA_VISIBLE_DEVICES, of a worker's GPUs; empty for a worker without GPUs."""
@@ -100,8 +104,7 @@ class Worker:
 
     def complaint(self) -> str | None:
         """Return the line that explains why the worker could not work; None after any other end."""
-        path = self.folder / LINE
-        return path.read_text(encoding="utf-8") if path.exists() else None
+        return read_complaint(self.folder)
 
 
 class LocalExecutor:
@@ -126,10 +129,27 @@ class LocalExecutor:
         self.workers = [(worker, number) for worker, number in self.workers if worker.alive()]
         users = [number for _, number in self.workers]
         least = min(range(len(self.gpu_groups)), key=users.count)
-        folder = self.folder.with_name(self.folder.name.replace("%j", uuid.uuid4().hex[:12]))
+        folder = name_folder(self.folder)
         process = start_process(work, folder, {VISIBLE: ",".join(self.gpu_groups[least])})
         self.workers.append((Worker(process, folder), least))
         return self.workers[-1][0]
+
+
+def name_folder(pattern: Path) -> Path:
+    """Return a new path for a worker: `pattern` with a random name in place of %j."""
+    return pattern.with_name(pattern.name.replace("%j", uuid.uuid4().hex[:12]))
+
+
+def prepare_work(work: Work, folder: Path) -> None:
+    """Make a worker's folder with the work that its process does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / WORK).write_bytes(pickle.dumps(work))
+
+
+def read_complaint(folder: Path) -> str | None:
+    """Return the line that the work in a worker's folder returned; None without one."""
+    path = folder / LINE
+    return path.read_text(encoding="utf-8") if path.exists() else None
 
 
 def start_process(
@@ -143,10 +163,9 @@ def start_process(
         environment: additional environment variables.
         with_parent: whether the new process ends when this process ends.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / WORK).write_bytes(pickle.dumps(work))
+    prepare_work(work, folder)
     command = [sys.executable, "-u", "-m", __name__, str(folder), *(["follow"] if with_parent else [])]
-    with open(folder / "log.txt", "ab") as log:
+    with open(folder / LOG, "ab") as log:
         return subprocess.Popen(
             command,
             env={**os.environ, **build_import_variables(), **environment},
@@ -158,15 +177,32 @@ def start_process(
 
 
 def do_work(folder: Path) -> None:
-    """Do the work that is pickled in a worker's folder. It is called in the worker's process."""
+    """Do the work that is pickled in a worker's folder. It is called in the worker's process.
+
+    The pickle is kept, because a cluster may start the worker again.
+    """
     collect_garbage_rarely()
     print_in_any_encoding()
     work: Work = pickle.loads((folder / WORK).read_bytes())
-    (folder / WORK).unlink()
     with treat_termination_as_interrupt():
         line = work()
     if line is not None:
         (folder / LINE).write_text(line, encoding="utf-8")
+
+
+def _beat(folder: Path) -> None:
+    """Touch the heartbeat from now on, and write the output to the log, also after the death of srun."""
+    with open(folder / LOG, "ab") as log:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(log.fileno(), stream.fileno())
+
+    def touch_regularly() -> None:
+        while True:
+            with contextlib.suppress(OSError):  # the disk may be full
+                (folder / HEARTBEAT).touch()
+            time.sleep(BEAT)
+
+    threading.Thread(target=touch_regularly, daemon=True).start()
 
 
 def _end_with_parent() -> None:
@@ -210,8 +246,10 @@ class DebugExecutor:
 
 
 if __name__ == "__main__":
-    if sys.argv[2:]:
+    if "follow" in sys.argv[2:]:
         threading.Thread(target=_end_with_parent, daemon=True).start()
+    if "beat" in sys.argv[2:]:
+        _beat(Path(sys.argv[1]))
     try:
         do_work(Path(sys.argv[1]))
     except KeyboardInterrupt:

@@ -1,23 +1,38 @@
-"""Workers that are jobs of a Slurm cluster, submitted with submitit as job arrays."""
+"""Workers that are jobs of a Slurm cluster, submitted as job arrays.
+
+Whether a job is in the queue is read from `squeue`, since many clusters keep no accounts for `sacct`. Whether
+its worker lives is read from the worker's heartbeat, since Slurm overlooks some dead steps for hours.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import logging
+import math
+import os
 import re
 import shlex
-from collections.abc import Iterator, Mapping
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import submitit
-import submitit.helpers
 
 from memmlp.common.errors import InputError
-from memmlp.common.processes import collect_garbage_rarely, pass_import_paths_to_children
-from memmlp.common.text_formats import print_in_any_encoding
+from memmlp.common.lease import ChangeTimer
+from memmlp.common.processes import build_import_variables
 from memmlp.sweep.executors import Work
+from memmlp.sweep.executors.local import HEARTBEAT, name_folder, prepare_work, read_complaint
+
+QUEUE_INTERVAL = 10.0  # seconds between two calls of squeue
+SILENCE = 45.0  # seconds without a heartbeat after which a worker counts as dead
+PATIENCE = 60.0  # seconds until a command of Slurm counts as failed
+WARNING = 90  # seconds before the time limit at which a job is queued again; Slurm may be a minute early
+MIN_WARNED_MINUTES = 4  # a shorter job has no time for the warning
+KEPT_VARIABLES = (
+    "SLURM_CONF",
+    "SLURM_CLUSTERS",
+)  # the others describe the job of this process, not the worker's
 
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
 RESERVED = ("array", "output", "error", "open_mode", "signal", "wrap", "wait", "parsable", "test_only")
@@ -105,69 +120,86 @@ def _parse_minutes(text: str) -> int:
     return (days * 24 + hours) * 60 + minutes + (seconds > 0)
 
 
-class RequeuedWork:
-    """Work that is queued again if its job is preempted. Runs continue from their checkpoints."""
+class Queue:
+    """The queued and running jobs of this user, read at most every QUEUE_INTERVAL."""
 
-    def __init__(self, work: Work):
-        self.work = work
+    def __init__(self, clusters: Sequence[str]):
+        self.command = [
+            "squeue",
+            "--noheader",
+            "--array",
+            f"--user={os.getuid()}",
+            "--format=%i %T",
+            *clusters,
+        ]
+        self.states: dict[str, str] | None = None
+        self.read_time = -math.inf
 
-    def __call__(self) -> str | None:
-        """Do the work. submitit calls this in the job's process."""
-        collect_garbage_rarely()
-        print_in_any_encoding()
-        return self.work()
-
-    def checkpoint(self) -> Any:
-        """Return a new submission of the work. submitit queues it when the job is preempted or times out."""
-        return submitit.helpers.DelayedSubmission(self)
-
-
-class SubmititSlurm(submitit.SlurmExecutor):
-    """Submitit's executor with memmlp's options."""
-
-    def set_options(self, options: SlurmOptions) -> None:
-        """Set the options of later submissions."""
-        given = {"additional_parameters": dict(options.parameters), "srun_args": list(options.srun)}
-        setup = {"setup": [options.setup]} if options.setup else {}
-        # submitit's default wckey is rejected by clusters without wckeys.
-        self.update_parameters(job_name="memmlp", time=options.minutes, wckey=None, **given, **setup)
-
-
-class UnsentSlurm(SubmititSlurm):
-    """An executor that only makes the submission file, also on machines without Slurm."""
-
-    @classmethod
-    def affinity(cls) -> int:
-        """Return 1, which tells submitit that Slurm is available."""
-        return 1
+    def find_state(self, job: str) -> str | None:
+        """Return the state of a job, such as PENDING; "" after its end, None while Slurm does not answer."""
+        if time.monotonic() - self.read_time > QUEUE_INTERVAL:
+            lines = call_slurm(self.command)
+            self.states = None if lines is None else dict(line.split(" ", 1) for line in lines if " " in line)
+            self.read_time = time.monotonic()
+        return None if self.states is None else self.states.get(job, "")
 
 
 class Job:
-    """A worker that is a job of Slurm."""
+    """A worker that is a job of Slurm.
 
-    def __init__(self, job: submitit.Job):
-        self.job = job
+    Args:
+        name: the job's name in Slurm, such as 42_0.
+        folder: the worker's folder.
+        queue: the queue of this user.
+        clusters: the option for Slurm's commands that chooses the cluster, or nothing.
+    """
+
+    def __init__(self, name: str, folder: Path, queue: Queue, clusters: Sequence[str]):
+        self.name, self.folder, self.queue, self.clusters = name, folder, queue, clusters
+        self._timer = ChangeTimer()
 
     def alive(self) -> bool:
-        """Return whether the job is waiting or working."""
-        return not self.job.done()
+        """Return whether the job waits or works.
+
+        A job that Slurm lists is cancelled if its worker began and is silent: Slurm did not notice its death,
+        or has queued the job again, where it waits for minutes.
+        """
+        state = self.queue.find_state(self.name)
+        if state == "":
+            return False
+        if not self.began or state == "SUSPENDED" or self._count_silent_seconds() < SILENCE:
+            return True
+        self.cancel()
+        return False
+
+    @property
+    def began(self) -> bool:
+        """Whether the worker began to work."""
+        return (self.folder / HEARTBEAT).exists()
+
+    def _count_silent_seconds(self) -> float:
+        def read() -> int:
+            with open(self.folder / HEARTBEAT, "rb") as file:  # on NFS, opening refreshes it from the server
+                return os.fstat(file.fileno()).st_mtime_ns
+
+        return self._timer.seconds_unchanged(self.name, read)
 
     def cancel(self) -> None:
         """End the job."""
-        self.job.cancel(check=False)
+        call_slurm(["scancel", *self.clusters, self.name])
 
     def complaint(self) -> str | None:
         """Return the line that explains why the worker could not work; None after any other end."""
-        if not self.job.paths.result_pickle.exists() or self.job.exception() is not None:
-            return None
-        return self.job.result()
+        if not self.began:
+            return f"job {self.name} ended before its worker began"
+        return read_complaint(self.folder)
 
 
 class Slurm:
     """Starts workers as jobs of the Slurm cluster of this machine.
 
     Args:
-        folder: the folder of the workers' logs, with %j in place of a job's number.
+        folder: the folder of the workers' logs, with %j in place of a name.
         options: the options of the jobs.
 
     Raises:
@@ -176,41 +208,89 @@ class Slurm:
 
     def __init__(self, folder: Path, options: SlurmOptions):
         _check_folder(folder)
-        with _convert_errors():
-            self.executor = SubmititSlurm(folder=folder, python=options.python)
-            self.executor.set_options(options)
-        self.imports = pass_import_paths_to_children if options.python is None else contextlib.nullcontext
+        if not shutil.which("sbatch"):
+            raise InputError("executor=slurm: Slurm is not installed on this machine (sbatch not found)")
+        self.folder, self.options = folder, options
         self.gpus = options.gpu
+        self.clusters = [
+            f"--clusters={name}" for key, name in options.parameters.items() if key == "clusters"
+        ]
+        self.queue = Queue(self.clusters)
 
     def submit(self, work: Work, count: int = 1) -> list[Job]:
-        """Start workers as a job array. Raises InputError if sbatch rejects an option."""
-        with _convert_errors():
-            with self.imports(), self.executor.batch():
-                jobs: list[Any] = [self.executor.submit(RequeuedWork(work)) for _ in range(count)]
-            return [Job(job) for job in jobs]
+        """Start workers as a job array. Raises InputError if Slurm does not answer, or rejects them."""
+        folder = name_folder(self.folder)
+        for number in range(count):
+            prepare_work(work, folder / str(number))
+        script = folder / "job.sh"
+        script.write_text(format_batch_script(folder, self.options, count), encoding="utf-8")
+        outside = {
+            name: value
+            for name, value in os.environ.items()
+            if not name.startswith(("SLURM_", "SRUN_")) or name in KEPT_VARIABLES
+        }
+        try:
+            done = subprocess.run(
+                ["sbatch", str(script)], env=outside, capture_output=True, text=True, timeout=PATIENCE
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise InputError(f"executor=slurm: sbatch: {error}") from None
+        job = re.search(r"job (\d+)", done.stdout)
+        if done.returncode or not job:
+            raise InputError(f"executor=slurm: {' '.join((done.stderr or done.stdout).split())}")
+        self.queue.read_time = -math.inf  # it was read before these jobs
+        names = [(f"{job[1]}_{number}", folder / str(number)) for number in range(count)]
+        return [Job(name, place, self.queue, self.clusters) for name, place in names]
+
+
+def call_slurm(command: Sequence[str]) -> list[str] | None:
+    """Return the output lines of a command of Slurm; None if it fails or does not answer."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.splitlines() if done.returncode == 0 else None
 
 
 def format_batch_script(folder: Path, options: SlurmOptions, workers: int) -> str:
-    """Return the text of the sbatch script for this number of workers, also on machines without Slurm."""
+    """Return the text of the sbatch script for this number of workers, also on machines without Slurm.
+
+    A job queues itself again before its time limit, so that the runs go on also without a controller.
+
+    Args:
+        folder: the folder of the workers; worker N has its subfolder N.
+        options: the options of the jobs.
+        workers: the number of workers.
+    """
     _check_folder(folder)
-    executor = UnsentSlurm(folder=folder, python=options.python)
-    executor.set_options(options)
-    if workers > 1:
-        executor.parameters["map_count"] = workers
-    return executor._make_submission_file_text(executor._submitit_command_str, "worker")
+    parameters: dict[str, str | bool] = {"job_name": "memmlp", "requeue": True, **options.parameters}
+    parameters |= {"array": f"0-{workers - 1}", "output": f"{folder}/%a/log.txt", "open_mode": "append"}
+    requeues = options.minutes >= MIN_WARNED_MINUTES and "no_requeue" not in parameters
+    if "no_requeue" in parameters:
+        del parameters["requeue"]
+    if requeues:
+        parameters["signal"] = f"B:USR2@{WARNING}"
+    lines = ["#!/bin/bash"]
+    for key, value in parameters.items():
+        lines.append(
+            f"#SBATCH --{key.replace('_', '-')}{'' if value is True else f'={shlex.quote(str(value))}'}"
+        )
+    lines += [options.setup] if options.setup else []
+    if options.python is None:  # another Python has its own packages
+        lines += [f"export {name}={shlex.quote(value)}" for name, value in build_import_variables().items()]
+    lines.append('[ -z "$SLURM_CPUS_PER_TASK" ] || export SRUN_CPUS_PER_TASK="$SLURM_CPUS_PER_TASK"')
+    lines += ["trap 'scontrol requeue \"$SLURM_JOB_ID\"' USR2"] if requeues else []
+    python = shlex.quote(sys.executable) if options.python is None else options.python
+    start = (
+        f"{python} -u -m memmlp.sweep.executors.local {shlex.quote(str(folder))}/$SLURM_ARRAY_TASK_ID beat"
+    )
+    # bash handles the signal only between commands, or during `wait`, which the signal ends.
+    lines += [f"{shlex.join(['srun', *options.srun])} {start} &", "wait $! || wait $!"]
+    return "\n".join(lines) + "\n"
 
 
 def _check_folder(folder: Path) -> None:
-    """Raise InputError for a folder with characters that Slurm or submitit would replace in log paths."""
+    """Raise InputError for a folder with characters that Slurm would replace in log paths."""
     path = folder.absolute().parent
     if not str(path).isprintable() or set(str(path)) & {*"%\\"}:
         raise InputError(f"executor=slurm: {path}: must not contain % or \\ or control characters; rename it")
-
-
-@contextlib.contextmanager
-def _convert_errors() -> Iterator[None]:
-    logging.getLogger("submitit").setLevel(logging.ERROR)
-    try:
-        yield
-    except (RuntimeError, TypeError, ValueError, NameError) as error:
-        raise InputError(f"executor=slurm: {' '.join(str(error).split())}") from None

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import read_json
 from memmlp.common.overrides import parse_overrides
 from memmlp.common.plain_yaml import parse_yaml
 from memmlp.common.text_formats import format_csv, parse_csv
+from memmlp.runs import records
+from memmlp.runs.records import SearchRecord
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import Search, Value
 
@@ -35,20 +36,25 @@ class FinishedSearch:
     """
 
     def __init__(self, folder: Path):
-        content, path = read_json(folder / "search.json"), folder / "trials.csv"
+        content, path = records.read(folder / "search.json", SearchRecord), folder / "trials.csv"
+        if damage := records.find_damage(folder / "search.json", SearchRecord):
+            raise InputError(damage)
         if "command_line" not in content or not path.is_file():
             raise InputError(
                 f"{folder}: must be the folder of a finished search, with search.json and trials.csv"
             )
         self.folder, self.content = folder, content
-        self.objective = str(content["objectives"][0]["text"])
-        self.keys = [str(one["key"]) for one in content["space"]]
+        self.objective = content["objectives"][0]["text"]
+        self.keys = [one["key"] for one in content["space"]]
         self.overrides = (*content["base"], *content["command_line"])
         model = [one.text for one in parse_overrides(self.overrides) if one.group == "model"]
         self.network = " ".join(model) or "model=mem_mlp"
-        self.trials = parse_csv(path.read_text(encoding="utf-8"))
-        complete = [row for row in self.trials if row["state"] == "complete"]
-        self.complete = sorted(complete, key=lambda row: float(row[self.objective]))
+        try:
+            self.trials = parse_csv(path.read_text(encoding="utf-8"))
+            complete = [row for row in self.trials if row["state"] == "complete"]
+            self.complete = sorted(complete, key=lambda row: float(row[self.objective]))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: must be the trials of a search ({error})") from None
 
     @property
     def best_values(self) -> dict[str, Value]:

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_search import director, finish, open_study, to_the_end, with_a_pruned_trial
@@ -47,3 +48,22 @@ def test_of_few_trials_it_says_why_there_is_no_importance(folder: Path):
     page = Searches(folder.parents[1]).describe("mine")
     assert page["importance"] == []
     assert page["too_few"].startswith("needs 25 complete trials; with 2")
+
+
+@pytest.mark.parametrize("changes", [{"storage": 5}, {"name": []}, {"objectives": None}, {"space": [[]]}])
+def test_a_damaged_search_hides_no_other(folder: Path, changes: dict[str, Any]):
+    study = open_study(folder)
+    write_json(folder / "search.json", asdict(study.search))
+    bad = folder.with_name("bad")
+    open_study(bad)
+    write_json(bad / "search.json", asdict(study.search) | changes)
+    searches = Searches(folder.parents[1])
+    assert "search.json: cannot be read" in searches.describe("bad")["error"]
+    assert "error" not in searches.describe("mine")
+
+
+def test_a_search_makes_no_database_where_its_record_says(folder: Path, tmp_path: Path):
+    study = open_study(folder)
+    write_json(folder / "search.json", asdict(study.search) | {"storage": f"sqlite:///{tmp_path}/new.db"})
+    assert Searches(folder.parents[1]).describe("mine")["error"] == "has not started"
+    assert not (tmp_path / "new.db").exists()

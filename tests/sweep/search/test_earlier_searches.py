@@ -76,3 +76,15 @@ def test_choices_of_a_group_beside_its_keys_and_choices_of_several_overrides():
     assert [one.key for one in made.space] == ["optim.lr", "optim", "loss"]
     assert made.overrides({"optim": "muon", "loss": "default"}) == ("optim=muon",)
     assert made.overrides({"loss": many}) == ("loss=kinematic", "predictor=rotation_only", "hand=off")
+
+
+@pytest.mark.parametrize(("file", "old", "new"), [
+    ("search.json", '"objectives"', '"other"'), ("search.json", '"text": "', '"text": 5, "x": "'),
+    ("search.json", "{", "["), ("trials.csv", "state", "other"), ("trials.csv", "complete,", "complete,x"),
+])  # fmt: skip
+def test_a_damaged_search_is_one_line(tmp_path: Path, file: str, old: str, new: str):
+    folder = finished(tmp_path, ["model=rpm"], tflop=5)
+    path = folder / file
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=file):
+        FinishedSearch(folder)
