@@ -55,7 +55,7 @@ def test_a_damaged_search_hides_no_other(folder: Path, changes: dict[str, Any]):
     study = open_study(folder)
     write_json(folder / "search.json", asdict(study.search))
     bad = folder.with_name("bad")
-    open_study(bad)
+    bad.mkdir()
     write_json(bad / "search.json", asdict(study.search) | changes)
     searches = Searches(folder.parents[1])
     assert "search.json: cannot be read" in searches.describe("bad")["error"]
