@@ -132,7 +132,8 @@ def add_worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--workers",
             "count",
             type=click.IntRange(1),
-            help="Number of concurrent workers.  [default: one per GPU, or one per core without GPUs]",
+            help="Number of concurrent workers. Local ones divide the cores: with 2 on 2 cores, each has one "
+            "thread.  [default: one per GPU, or one per core without GPUs]",
         ),
         click.option(
             "--gpus-per-worker",

@@ -84,7 +84,7 @@ class OptimSettings(Settings):
         if own["tflop"] is not None and own["warmup"] >= 1:
             yield f"optim.warmup={own['warmup']}: must be below 1, a fraction of the steps, with optim.tflop"
         if own["tflop"] is not None and config["refiner"] is not None:
-            yield f"optim.tflop={own['tflop']}: must be null with a refiner, which has two trainings"
+            yield f"optim.tflop={own['tflop']}: must be null with a refiner; the network uses all of it"
 
 
 @component("optim", "adamw", builds="Optim")
