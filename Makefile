@@ -37,7 +37,7 @@ coverage: $(STAMP)
 	$(PYTEST) --cov --cov-report=term:skip-covered
 
 mutants: $(STAMP)
-	$(BIN)/python tests/mutants.py $(MUTANTS)
+	$(BIN)/python benchmarks/mutants.py $(MUTANTS)
 
 golden: $(STAMP)
 	$(BIN)/python tests/golden.py

@@ -7,10 +7,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-from benchmarks.chaos import examine
 from command_line import BRIEF, run_apart
 from command_line import run as command
 
+from benchmarks.chaos import examine
 from memmlp.cli.tune import prepare_search, search
 from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from benchmarks import chaos
 from command_line import BRIEF, SMALL, in_folder, run, run_apart
 from processes import Forked, forked, until
 
+from benchmarks import chaos
 from memmlp.cli.tune import SearchSetup, prepare_search
 from memmlp.common.lease import current_process
 from memmlp.networks import checkpoint

@@ -1,6 +1,6 @@
 """Change random lines of the package, one at a time: do the tests of its module fail?
 
-    python tests/mutants.py --count 20 --seed 0
+    python benchmarks/mutants.py --count 20 --seed 0
 
 Each mutant is tested in a copy of the checkout, by the test file that mirrors its module, or else by its
 folder's tests. Exits with 1 if a mutant survives: a test is missing, or the change makes no difference.

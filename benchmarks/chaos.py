@@ -1,7 +1,7 @@
 """Kill a sweep's and a search's processes at random; the results must be those of undisturbed ones.
 
-    python tests/benchmarks/chaos.py --runs 12 --kills 20
-    python tests/benchmarks/chaos.py --during export --kills 40 --trials 0
+    python benchmarks/chaos.py --runs 12 --kills 20
+    python benchmarks/chaos.py --during export --kills 40 --trials 0
 
 Exits with 1 where they differ. tests/kills runs the same with a few kills.
 """

@@ -1,6 +1,6 @@
 """Simulate tables with a known truth, and count how often verdicts are wrong.
 
-Run `python tests/benchmarks/verdicts.py --tables 5000 --seed 20253`; docs/results/verdicts.md has the output.
+Run `python benchmarks/verdicts.py --tables 5000 --seed 20253`; docs/results/verdicts.md has the output.
 Axes of arrays: K comparisons (T tables of TABLE each), S seeds, C clips, G clip groups.
 """
 

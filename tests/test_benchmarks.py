@@ -1,0 +1,79 @@
+"""Simulated differences have the documented variances; p keeps its level, and resampling tests do not."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from benchmarks import few_groups, verdicts
+from benchmarks.verdicts import Shares, Simulated, SimulationSetting
+from memmlp.report.tables.statistics import estimate_error
+
+
+def test_means_of_few_groups_have_a_variance_of_one():
+    for shape in set(few_groups.SHAPES) - {"heavy tails"}:  # whose sample variances vary without limit
+        for shares in few_groups.SHARES:
+            drawn = few_groups.draw_differences(np.random.default_rng(2), 8000, 3, 9, shape, shares)
+            assert drawn.mean((1, 2)).var() == pytest.approx(1, abs=0.1), (shape, shares)
+
+
+def test_flips_are_the_exact_test_and_the_bootstrap_is_near_students():
+    sample = np.random.default_rng(4).normal(0.5, 1, 9)
+    p = few_groups.compute_resampled_p(np.random.default_rng(0), sample[None])
+    known = stats.permutation_test((sample,), np.mean, permutation_type="samples", n_resamples=np.inf)
+    assert p["flips"][0] == pytest.approx(known.pvalue)
+    for name in ("flips of skew-corrected t", "bootstrap-t"):
+        assert p[name][0] == pytest.approx(stats.ttest_1samp(sample, 0).pvalue, abs=0.05)
+
+
+def test_p_keeps_its_level_and_resampling_does_not():
+    assert not few_groups.find_broken([error for error, _ in few_groups.simulate(9, 5, 200, 0).values()], 200)
+    errors = few_groups.simulate_resampling("skewed differences", 14, 1000, 0)
+    assert few_groups.find_broken(errors.pop("flips"), 1000)
+    assert not few_groups.find_broken(errors.pop("p")[:1], 1000)
+
+
+@pytest.mark.parametrize("cell", [SimulationSetting(5, 10, 1), SimulationSetting(5, 11, 2)])
+def test_mixed_effects_equal_simulated_differences(cell: SimulationSetting):
+    sample = Simulated(np.random.default_rng(3), cell, 24)
+    rng = np.random.default_rng(3)
+    of_seeds = np.sqrt(cell.seeds) * rng.normal(size=(24, cell.seeds))
+    fixed, noise, _ = verdicts.draw(rng, cell, 24)
+    shares = Shares(1, 2, 3, 4, 5)
+    weights = np.sqrt(np.array(shares) / 15)
+    by_group = weights[0] * of_seeds[:, :, None] + weights[4] * noise
+    by_group = by_group + np.einsum("i,kig->kg", weights[1:4], fixed)[:, None]
+    differences = by_group[:, :, cell.groups]
+    for seeds in (3, 5):
+        known, mean = sample.mixed(shares, seeds)
+        expected = estimate_error(differences[:, :seeds], cell.groups)
+        np.testing.assert_allclose(known.variances, expected.variances)
+        assert (known.seeds, known.groups) == (expected.seeds, expected.groups)
+        np.testing.assert_allclose(mean, differences[:, :seeds].mean((1, 2)))
+
+
+def test_means_have_a_variance_of_one():
+    sample = Simulated(np.random.default_rng(0), SimulationSetting(3, 11, 2), 24000)
+    for name, shares in verdicts.SHARES.items():
+        known, mean = sample.mixed(shares, 3)
+        assert mean.var() == pytest.approx(1, abs=0.06), name
+        a, b, e = known.variances.mean(1)
+        assert a + b - e == pytest.approx(1, abs=0.06 if shares.groups else 0.2), name
+
+
+def test_a_cell_is_reproducible_and_broken_promises_are_listed():
+    assert len(verdicts.grid()) == 40
+    small, large = SimulationSetting(3, 4, 2), SimulationSetting(10, 40, 1)
+    assert (
+        verdicts.simulate(small, 20, 1) == verdicts.simulate(small, 20, 1) != verdicts.simulate(small, 20, 2)
+    )
+    campaign = verdicts.simulate(large, 20, 0)["campaign"]
+    assert campaign["decided"] > 0.95
+    assert campaign["seeds"] < 9
+    assert campaign["error"] <= 0.05
+    row = {"tables": 1000, "shares": {"one": {"coverage": 0.95, "error": 0.05, "sequential_error": 0.03}}}
+    assert verdicts.broken(row, True) == []
+    row["shares"]["other"] = {"coverage": 0.999, "error": 0.09, "sequential_error": 0.01}
+    assert verdicts.broken(row, False) == ["error 9.00 % (other)"]
+    assert verdicts.broken(row, True) == ["error 9.00 % (other)", "coverage 99.90 % (other)"]
+    row["shares"]["other"] = {"coverage": 0.92, "error": 0.0, "sequential_error": 0.09}
+    assert verdicts.broken(row, True) == ["coverage 92.00 % (other)", "sequential_error 9.00 % (other)"]
