@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test test-fast test-slurm coverage mutants golden check docs dist pre-commit clean
+.PHONY: setup demo test test-all test-fast test-slurm coverage mutants golden check docs dist pre-commit clean
 
 setup: $(STAMP)
 
@@ -19,22 +19,25 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/memmlp demo
 
-# One process more than cores, since some tests wait for other processes. They share compiled code.
+# As many processes as cores: each imports torch and collects the tests. They share compiled code.
 CORES := $(shell $(PYTHON) -c 'import os; print(os.cpu_count())')
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $$(($(CORES) + 1))
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $(CORES)
 
 test: $(STAMP)
 	$(PYTEST)
 
+test-all: $(STAMP)
+	$(PYTEST) -m "long or not long"
+
 test-fast: $(STAMP)
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow and not long"
 
 # A real Slurm of one node in a temporary folder, where Debian's slurm-wlm and munge are installed; ten minutes.
 test-slurm: $(STAMP)
 	MEMMLP_SLURM=1 $(BIN)/python -m pytest -rs -s tests/sweep/executors/test_real_slurm.py
 
 coverage: $(STAMP)
-	$(PYTEST) --cov --cov-report=term:skip-covered
+	$(PYTEST) -m "long or not long" --cov --cov-report=term:skip-covered
 
 mutants: $(STAMP)
 	$(BIN)/python benchmarks/mutants.py $(MUTANTS)

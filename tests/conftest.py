@@ -38,9 +38,9 @@ logging.getLogger("torch.__trace").addHandler = lambda handler: None  # type: ig
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that need a trained run are slow; files with slow tests come first."""
+    """Long tests and those that need a trained run are slow; files with slow tests come first."""
     for item in items:
-        if {"home", "tiny_home"} & set(item.fixturenames):
+        if {"home", "tiny_home"} & set(item.fixturenames) or item.get_closest_marker("long"):
             item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT))

@@ -115,7 +115,7 @@ def check(text: str, whole: bool = True) -> None:
         assert set(words) <= set(targets[0].split())
     else:
         for at, word in enumerate(words):
-            if word.startswith(("docs/", "tests/")) and Path(word).suffix:
+            if word.startswith(("docs/", "benchmarks/")) and Path(word).suffix:
                 check_script(ROOT / word, [other for other in words[at + 1 :] if other != "--"])
 
 

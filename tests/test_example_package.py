@@ -16,7 +16,7 @@ QUICK = [*TINY, "optim.steps=6"]
 OWN = [f"plugins=[{PACKAGE}]", "experiment=feet"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_commands_take_custom_components(on_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert "FootSkate" in run(tmp_path, "train", *OWN, *QUICK)
     (made,) = list_runs(tmp_path / "outputs")

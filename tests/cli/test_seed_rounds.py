@@ -117,7 +117,9 @@ def test_seeds_go_where_verdicts_are_open(memmlp: Memmlp, runs: Runs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("patience", [0, 9, 11, 18])
+@pytest.mark.parametrize(
+    "patience", [0, 11, *(pytest.param(runs, marks=pytest.mark.long) for runs in (9, 18))]
+)
 def test_interrupted_anywhere_it_ends_the_same(memmlp: Memmlp, runs: Runs, patience: int):
     runs.patience = patience
     assert memmlp(*SWEEP).code == 130

@@ -29,7 +29,7 @@ def environment(file: Path) -> dict[str, str]:
     return dict(word.split("=", 1) for word in file.read_text().split("\0") if word)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_make_the_run_of_one(tmp_path: Path):
     """Its VQ-VAE and its network; the first process alone writes and evaluates (and would deploy).
 

@@ -176,7 +176,7 @@ def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
     assert all(words in said for words in ("trial 0: not the mean of its runs", "of no trial"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_trial_trains_for_the_same_compute(tmp_path: Path):
     """The batch is searched, and so is the number of steps; the objective is of the best validation."""
     budget, own = 0.001, [word for word in TINY if "steps" not in word and "validate" not in word]

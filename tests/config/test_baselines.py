@@ -22,10 +22,13 @@ PUBLISHED = {
     "manikin_s": (4_244_566, 160_585_125), "manikin_l": (63_889_240, 71_688_468_961),
     "sage": (120_269_534, 4_113_193_316), "rpm": (9_626_756, 188_221_172),
 }  # fmt: skip
+LARGE = ("bodiffusion", "avatar_jlm", "manikin_l", "sage")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PUBLISHED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long) if name in LARGE else name for name in PUBLISHED]
+)
 def test_paper_profile_has_the_published_size(name, monkeypatch):
     monkeypatch.setattr("torch.nn.Linear.reset_parameters", lambda layer: None)
     monkeypatch.setattr("torch.Tensor.normal_", lambda tensor, *_, **options: tensor.zero_())

@@ -91,7 +91,9 @@ def variants(axis: str) -> list[list[str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis", TRAINED)
+@pytest.mark.parametrize(
+    "axis", ["memory", *(pytest.param(axis, marks=pytest.mark.long) for axis in list(TRAINED)[1:])]
+)
 def test_every_value_trains_streams_and_changes_something(axis, home):
     base, *others = (trained(*words) for words in variants(axis))
     for arm in (base, *others):

@@ -45,7 +45,10 @@ def weights(graph: onnx.GraphProto) -> dict[str, int]:
     return {name.removesuffix("_quantized"): types.get(name, 0) for name in names}
 
 
-@pytest.mark.parametrize("network", ["mem_mlp", "avatar_jlm", "manikin_s"])
+@pytest.mark.parametrize(
+    "network",
+    ["mem_mlp", *(pytest.param(one, marks=pytest.mark.long) for one in ("avatar_jlm", "manikin_s"))],
+)
 def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, network):
     quantised, stream = tmp_path / "int8.onnx", make_streaming_graph(exported.NETWORKS[network]())
     write_lower_precision("int8", step_files(network), quantised, stream, [CLIPS[0][:20]])

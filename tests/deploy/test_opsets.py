@@ -28,7 +28,9 @@ def model(*nodes: onnx.NodeProto, **constants: np.ndarray) -> ModelProto:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", ["mem_mlp", "lstm", "bodiffusion", "hmd_poser"])
+@pytest.mark.parametrize(
+    "network", ["mem_mlp", "lstm", "hmd_poser", pytest.param("bodiffusion", marks=pytest.mark.long)]
+)
 def test_a_step_computes_the_same_in_every_opset(
     step_files: Callable[[str], Path], tmp_path: Path, network: str
 ):

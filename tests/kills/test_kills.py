@@ -64,13 +64,13 @@ def fork_controllers(folder: Path, monkeypatch: pytest.MonkeyPatch, *workers: st
     monkeypatch.setattr(chaos, "start", start)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fork_controllers(tmp_path, monkeypatch, "executor=debug")
     assert chaos.sweep_storm(2, 2, 2, random.Random(0), [*SMALL, *QUICK]) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("during", ["checkpoints", "evaluation", "export"])
 def test_a_sweep_whose_workers_are_killed_in_one_stage_ends_as_an_undisturbed_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, during: str
@@ -81,7 +81,7 @@ def test_a_sweep_whose_workers_are_killed_in_one_stage_ends_as_an_undisturbed_on
     assert chaos.sweep_storm(2, 2, 1, random.Random(0), words, during) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_search_under_kills_has_every_trial_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fork_controllers(tmp_path, monkeypatch, "--workers", "1")
     assert chaos.search_storm(2, 1, 1, random.Random(0), SMALL) == []

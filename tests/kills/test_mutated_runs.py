@@ -37,7 +37,7 @@ from memmlp.sweep.progress_table import render
 from memmlp.sweep.sweep_file import parse_sweep
 
 MAX_SECONDS, MAX_BYTES = 5.0, 300e6
-COUNTS = [40, pytest.param(500, marks=pytest.mark.slow)]
+COUNTS = [40, pytest.param(500, marks=pytest.mark.long)]
 
 
 @contextmanager
@@ -99,7 +99,7 @@ def test_damaged_runs_hide_no_other(memmlp: Memmlp, tmp_path: Path, count: int):
 
 @pytest.mark.slow
 def test_a_list_of_damaged_runs_takes_little_memory(tmp_path: Path):
-    make_mutants(tmp_path, 500, seed=1)
+    make_mutants(tmp_path, 100, seed=1)
     code = (
         f"from memmlp.cli.main import main; main(['runs', 'list', '--all', '--outputs', {str(tmp_path)!r}])"
     )

@@ -120,8 +120,18 @@ def test_a_network_without_a_streaming_graph_is_refused():
         make_streaming_graph(model)
 
 
+EXPORTED_ALONE = set(exported.BASELINES) - {"avatar_poser", "hmd_poser", "sage"}
+"""Networks whose files no other test needs."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("network", exported.NETWORKS)
+@pytest.mark.parametrize(
+    "network",
+    [
+        pytest.param(name, marks=pytest.mark.long) if name in EXPORTED_ALONE else name
+        for name in exported.NETWORKS
+    ],
+)
 def test_its_file_is_the_network_in_onnx_runtime(step_files: Callable[[str], Path], network: str):
     path, model = step_files(network), exported.NETWORKS[network]()
     assert measure_largest_difference(model, path, tiny.clip(20)) < 1e-4

@@ -13,7 +13,7 @@ SHORT = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["manikin_s", "recurrent_poser"])
+@pytest.mark.parametrize("name", [pytest.param("manikin_s", marks=pytest.mark.long), "recurrent_poser"])
 def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp):
     """What is exported of each is compared in tests/deploy and tests/live."""
     ran = memmlp("train", f"model={name}", *SHORT)

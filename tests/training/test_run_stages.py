@@ -161,8 +161,12 @@ def test_changed_weights_are_not_evaluated_and_what_is_exported_is_checked_on_th
     assert "changed since the training" in command(home, "eval", str(copy.folder), "--again", code=2)
 
 
+EXPERIMENTS = sorted(path.stem for path in find_packaged_folder("conf/experiment").glob("*.yaml"))
+
+
 @pytest.mark.parametrize(
-    "name", sorted(path.stem for path in find_packaged_folder("conf/experiment").glob("*.yaml"))
+    "name",
+    ["paper", *(pytest.param(name, marks=pytest.mark.long) for name in EXPERIMENTS if name != "paper")],
 )
 def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.MonkeyPatch):
     """Two steps and one validation of each, on the prepared data, without export."""

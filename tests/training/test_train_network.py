@@ -23,7 +23,9 @@ CHAINS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", CHAINS)
+@pytest.mark.parametrize(
+    "network", ["model=mem_mlp", *(pytest.param(one, marks=pytest.mark.long) for one in list(CHAINS)[1:])]
+)
 def test_every_kind_of_training_can_do_without_validation(memmlp, network):
     few = [f"{group}.steps=2" for group in ("optim", "vqvae")]
     few += [f"prerequisite.{part}.steps=2" for part in PARTS if network == "model=sage"]

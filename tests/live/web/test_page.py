@@ -18,7 +18,7 @@ from memmlp.live.stream import Stream
 from memmlp.live.wearer import Offsets
 from memmlp.live.web.site import NUMBERS, pack_clip
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 HEADSET = Path(__file__).with_name("headset.js")
 SITE = "document.documentElement.dataset"

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from benchmarks import chaos
 from command_line import BRIEF, MAIN
 from processes import until
 from sweep.executors.slurm_cluster import find_missing_commands, list_jobs, running_cluster, slurm
 
+from benchmarks import chaos
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 from memmlp.sweep.executors.local import HEARTBEAT
