@@ -1,4 +1,4 @@
-"""Documentation is correct: commands parse and compose, links lead somewhere, numbers have a source."""
+"""Documentation is correct: commands parse and compose, links lead somewhere."""
 
 import importlib
 import re
@@ -41,7 +41,6 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"(?<!`)`(memmlp [^`\n]+(?:\n[^`\n]+)?)`(?!`)")
 OUTSIDE_CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?= ?(?:ms|cm|°|%|times)(?!\w))|(?<![\w.])\d+\.\d+(?![\w.])")
 
 
 class Line(NamedTuple):
@@ -79,8 +78,15 @@ LINES = sorted((line for page in PAGES for line in commands_of(page)), key=lambd
 LINES = list({line.text: line for line in reversed(LINES)}.values())  # whole ones have priority
 
 
+START = [line for line in LINES if line.page == "README.md" or line.page.startswith("docs/quickstart")]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("line", LINES, ids=str)
+@pytest.mark.parametrize(
+    "line",
+    [line if line in START else pytest.param(line, marks=pytest.mark.long) for line in LINES],
+    ids=str,
+)
 def test_commands_are_valid(line: Line, on_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -273,19 +279,6 @@ def test_extras_and_metrics_are_those_of_the_package():
     rows = re.findall(r"^\| `(.+?)` \| (.+?) \| (.+?) \|", text, re.MULTILINE)
     listed = {name: (unit, float(smallest)) for name, unit, smallest in rows if name in UNITS}
     assert listed == {name: (UNITS[name], SMALLEST[name]) for name in UNITS if name != "GT Jitter"}
-
-
-def test_numbers_in_readme_are_in_the_linked_results():
-    """The paragraph, item or row of a measured number links to a file of docs/results with that number."""
-    text = OUTSIDE_CODE.sub("", (ROOT / "README.md").read_text(encoding="utf-8"))
-    found = 0
-    for part in re.split(r"\n\s*\n|\n(?=[|-] ?)", text):
-        sources = [ROOT / link for link in LINK.findall(part) if link.startswith("docs/results/")]
-        kept = "".join(source.read_text(encoding="utf-8") for source in sources if source.suffix == ".md")
-        for number in MEASURED.findall(re.sub(r"Python \d[\d.]*", "", LINK.sub("", part))):
-            found += 1
-            assert re.search(rf"(?<![\d.]){re.escape(number)}(?![\d.])", kept), f"{number}: {part}"
-    assert found >= 2
 
 
 @pytest.fixture

@@ -88,12 +88,6 @@ def test_bad_input_is_one_line(memmlp: Memmlp, finished: Run, monkeypatch: pytes
         assert one_line(memmlp("live", str(place), "--no-browser"), *words)
 
 
-def test_eval_says_that_code_has_changed_since(memmlp, finished: Run, monkeypatch):
-    monkeypatch.setattr(Run, "changed_sources", property(lambda self: ["evaluation/metrics.py"]))
-    said = memmlp("eval", finished.id).out
-    assert f"the code of evaluation/metrics.py has changed since run {finished.id}" in said
-
-
 class Watched:
     """`memmlp live` in a process of its own, until the test ends."""
 

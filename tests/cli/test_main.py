@@ -102,12 +102,6 @@ def test_help_and_refusals_of_an_unknown_run_import_nothing_slow(tmp_path: Path)
     assert all(f"  {name} " in ran.stdout for name in COMMANDS)
 
 
-def test_every_command_has_help(memmlp: Memmlp):
-    for name in COMMANDS:
-        ran = memmlp(name, "--help")
-        assert (ran.code, ran.err, "memmlp" in ran.out) == (0, "", True), name
-
-
 def test_help_of_train_lists_what_can_be_chosen_and_nothing_else(memmlp: Memmlp):
     said = memmlp("train", "--help", "memory=none", "device=cpu").out
     groups = said.partition("== Config ==")[0]

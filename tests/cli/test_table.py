@@ -1,7 +1,6 @@
 """`memmlp table`: what it prints and writes, and what it refuses."""
 
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -37,13 +36,6 @@ def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, 
         assert (ran.code, ran.out) == (0, f"out/t.{ending}\n")
         assert word in Path(f"out/t.{ending}").read_text()
     assert json.loads(memmlp("table", "5", "--format", "json").out)["number"] == 5
-
-
-@pytest.mark.slow
-def test_command_prints_all_tables(memmlp: Memmlp, planned: None):
-    out = memmlp("table", "all", "--mode", "stream").out
-    assert [int(number) for number in re.findall(r"^Table (\d+):", out, re.MULTILINE)] == list(range(1, 18))
-    assert "nothing measured: data.root: has no value" in " ".join(out.split())
 
 
 def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):

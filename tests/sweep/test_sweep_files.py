@@ -70,7 +70,7 @@ OF_SEVERAL = {
 """The numbers of components that labels name, where it is not one."""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_row_that_changes_more_than_its_label_names_is_confounded():
     """Without a position branch there is no hand term and no inverse kinematics, so they do not count."""
     for path in FILES:
@@ -90,34 +90,3 @@ def test_a_row_that_changes_more_than_its_label_names_is_confounded():
                 changed -= {"hand"} if "predictor" in changed and "model" not in changed else set()
                 several = len(changed) > OF_SEVERAL.get(label, 1)
                 assert several == bool(variant.confounded), (path.stem, label, changed)
-
-
-@pytest.mark.slow
-def test_the_decomposition_changes_one_ingredient_a_step():
-    """Each variant's config differs from its control's in what its label names, or only its branch does."""
-    sweep = load_sweep(FOLDER / "decomposition.yaml")
-    variants = {variant.label: variant for variant in sweep.variants}
-    configs = {label: compose_flat(*sweep.merge_overrides(one)) for label, one in variants.items()}
-    changed = {}
-    for label, variant in variants.items():
-        control = sweep.find_control(variant)
-        if control and label != "AGRoL-MLP-41":
-            one, other = configs[label], configs[control]
-            keys = {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}
-            changed[label] = {key.split(".")[0] for key in keys}
-            changed[label] |= {"branch"} if variant.branch != variants[control].branch else set()
-    assert changed == {
-        "+ features": {"normalizer"}, "+ Mem-MLP's backbone": {"model", "memory", "predictor", "hand"},
-        "+ Eqs. 1-2": {"loss"}, "+ learned weights": {"loss"}, "+ second branch": {"predictor", "evaluation"},
-        "+ hand term": {"hand"}, "+ memory": {"memory"}, "+ IK: the full model": {"branch"},
-        "less memory": {"memory"}, "less hand term": {"hand"},
-        "less second branch": {"predictor", "hand", "evaluation", "branch"}, "less learned weights": {"loss"},
-        "less Eq. 2": {"loss"},
-    }  # fmt: skip
-    assert configs["+ Eqs. 1-2"]["loss.rotation_velocity"] == 30
-    assert configs["less Eq. 2"]["loss.rotation_velocity"] == 0
-    trained = [
-        {key: value for key, value in config.items() if not key.startswith("evaluation.ik")}
-        for config in configs.values()
-    ]
-    assert len({str(sorted(map(str, config.items()))) for config in trained}) == 12
