@@ -8,6 +8,7 @@ import functools
 import io
 import json
 import os
+import select
 import shutil
 import subprocess
 import tempfile
@@ -83,6 +84,8 @@ class Chromium:
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self.buffer:
+            ready, _, _ = select.select([self.read], [], [], 2 * PATIENCE)
+            assert ready, "the browser does not answer"
             part = os.read(self.read, 1 << 16)
             assert part, "the browser is gone"
             self.buffer += part
