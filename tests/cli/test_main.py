@@ -10,20 +10,12 @@ from unittest.mock import Mock
 import click
 import pytest
 from conftest import Memmlp, one_line
-from omegaconf import DictConfig
 from processes import finished
 
 import memmlp as package
 from memmlp.cli.main import COMMANDS, main
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.plugins import find_packaged_folder
-
-
-@pytest.fixture
-def jobs(monkeypatch: pytest.MonkeyPatch) -> list[DictConfig]:
-    seen: list[DictConfig] = []
-    monkeypatch.setattr("memmlp.cli.train.run_training", seen.append)
-    return seen
 
 
 def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -148,46 +140,6 @@ def test_tracebacks_on_request(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MEMMLP_TRACEBACK", "1")
     with pytest.raises(InputError, match="unknown command"):
         main(["trian"])
-
-
-def test_train_gives_the_job_its_config(memmlp: Memmlp, jobs: list[DictConfig], tmp_path: Path):
-    ran = memmlp("train", "profile=tiny", "memory=none", "seed=3")
-    assert (ran.code, ran.out, ran.err) == (0, "", "")
-    (cfg,) = jobs
-    assert (cfg.seed, cfg.model.width, cfg.memory.name) == (3, 16, "none")
-    assert "hydra" not in cfg
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arguments", [["seed=0,1", "-m"], ["hydra.mode=MULTIRUN", "seed=0,1"]])
-def test_a_multirun(memmlp: Memmlp, jobs: list[DictConfig], tmp_path: Path, arguments: list[str]):
-    assert (memmlp("train", *arguments).code, [cfg.seed for cfg in jobs]) == (0, [0, 1])
-    assert {path.name for path in tmp_path.rglob("*")} <= {"outputs", "multirun", "multirun.yaml"}
-
-
-def test_jobs_that_would_save_predictions_in_one_folder_are_refused(memmlp: Memmlp, jobs: list[DictConfig]):
-    ran = memmlp("train", "-m", "seed=0,1", "save_predictions=there")
-    assert ran.code == 2
-    assert ran.err.startswith("memmlp: save_predictions=there: 2 jobs")
-    assert jobs == []
-    assert memmlp("train", "-m", "seed=0,1", "save_predictions=there/${seed}").code == 0
-    assert [cfg.save_predictions for cfg in jobs] == ["there/0", "there/1"]
-
-
-@pytest.mark.slow
-def test_a_failed_job_does_not_stop_the_others(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
-    seeds = []
-
-    def job(cfg: DictConfig) -> None:
-        seeds.append(cfg.seed)
-        if cfg.seed < 2:
-            raise InputError(f"seed {cfg.seed} is bad")
-
-    monkeypatch.setattr("memmlp.cli.train.run_training", job)
-    ran = memmlp("train", "-m", "seed=0,1,2")
-    assert (seeds, ran.code) == ([0, 1, 2], 2)
-    assert ran.err.splitlines() == ["memmlp: seed 0 is bad", "memmlp: seed 1 is bad"]
 
 
 def test_completion(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
