@@ -66,7 +66,7 @@ def test_avatar_poser_is_the_network_of_torch_layers():
     torch.testing.assert_close(theirs(window), ours.predict_rotations(window), atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_graph_is_timed_and_compared(memmlp: Memmlp, tmp_path):
     file = tmp_path / "rows.json"
     ran = memmlp("bench", "latency", *BENCHED, "--models", "avatar_poser", "--steps", "2", "--json", file)

@@ -78,7 +78,7 @@ def test_only_the_same_form_that_is_whole_is_copied(home: Path, tmp_path: Path):
     assert not out.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_in_fp16_for_unity(home: Path, tmp_path: Path, memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
     run = find_trained(home).id

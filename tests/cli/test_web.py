@@ -16,6 +16,7 @@ from memmlp.common.npm import ONNXRUNTIME_WEB, fetch_tarball
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.long
 def test_a_site_to_play_and_wear(home: Path):
     try:
         fetch_tarball(ONNXRUNTIME_WEB)

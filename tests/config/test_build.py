@@ -121,7 +121,7 @@ EXPORTED = [
 """Values that make another graph; other memories' graphs are in tests/exported.py."""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("overrides", EXPORTED, ids=" ".join)
 def test_every_kind_of_graph_exports(overrides, tmp_path):
     model = network([*TINY, *SMALL, "vqvae.encoder_depth=1", "vqvae.decoder_depth=1", *overrides])

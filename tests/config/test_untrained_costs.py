@@ -19,7 +19,7 @@ METRICS = ["FLOPs", "MACs", "size", "parameters"]
 SWEEP = parse_sweep("sizes", {"variants": ARMS, "metrics": METRICS, "base": ["profile=tiny"], "seeds": [3]})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: Path):
     run = load_measured_run(fake_run(tmp_path, "mine", 3).folder)
     runs, flags = measure_untrained_variants(SWEEP, {"Mem-MLP": {3: run}, "AvatarPoser": {}})
