@@ -19,9 +19,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/memmlp demo
 
-# As many processes as cores: each imports torch and collects the tests. They share compiled code.
+# One process more than cores, since some tests wait for other processes. They share compiled code.
 CORES := $(shell $(PYTHON) -c 'import os; print(os.cpu_count())')
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $(CORES)
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $$(($(CORES) + 1))
 
 test: $(STAMP)
 	$(PYTEST)
