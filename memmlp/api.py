@@ -45,7 +45,7 @@ def load_run(name: StrPath, outputs: StrPath | None = None, *, plugins: Sequence
     """Open the finished run of a motion network.
 
     Args:
-        name: the run's id, the beginning of its id, or its folder.
+        name: the run's id, the beginning of its id, its folder, or the name of a shipped network.
         outputs: the folder of runs; by default $MEMMLP_OUTPUTS or "outputs", like on the command line.
         plugins: packages with custom components; their code is imported. Installed packages with an entry
             point are used without this argument. A run's record never causes an import.

@@ -54,12 +54,13 @@ def bin_folder(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_has_what_the_commands_need(wheel: Path):
     names = set(zipfile.ZipFile(wheel).namelist())
-    for folder in ("conf", "sweeps"):
-        ours = {
-            f"memmlp/_{folder}/{path.relative_to(ROOT / folder)}" for path in (ROOT / folder).rglob("*.yaml")
-        }
+    for folder in ("conf", "sweeps", "models"):
+        kinds = (".yaml", ".json", ".onnx", ".npz", ".safetensors")
+        files = (path for path in (ROOT / folder).rglob("*.*") if path.suffix in kinds)
+        ours = {f"memmlp/_{folder}/{path.relative_to(ROOT / folder)}" for path in files}
         assert ours
         assert ours <= names
+    assert wheel.stat().st_size <= 12e6
     package = {path.relative_to(ROOT) for path in (ROOT / "memmlp").rglob("*") if path.is_file()}
     assert {path.as_posix() for path in package if "__pycache__" not in path.parts} <= names
     assert not {name for name in names if name.startswith(("tests/", "docs/"))}
@@ -79,13 +80,16 @@ def test_it_works_outside_the_checkout(bin_folder: Path, tmp_path: Path):
     where = run(python, "-c", "import memmlp; print(memmlp.__file__, memmlp.Stream)", folder=tmp_path)
     assert str(ROOT) not in where
     assert memmlp.__version__ in run(command, "--version", folder=tmp_path)
-    run(command, "demo", *TINY, folder=tmp_path)
+    run(command, "train", "data=synth", *TINY, folder=tmp_path)
+    assert "recurrent_poser" in run(command, "models", folder=tmp_path)
+    named = run(python, "-c", "import memmlp; print(memmlp.Stream('recurrent_poser'))", folder=tmp_path)
+    assert "_models" in named
     assert "runs" in run(command, "sweep", "14", "profile=tiny", "--dry-run", folder=tmp_path)
     (tmp_path / "mine.yaml").write_text("variants: {without: [memory=none]}")
     said = run(command, "sweep", "mine.yaml", *TINY, "export.graph=off", folder=tmp_path)
     assert "1 of 1 runs done" in said
     made = sorted(map(str, (tmp_path / "outputs/runs").glob("*/deployments/*/step.onnx")))
-    assert len(made) == 2  # the demo's two networks
+    assert len(made) == 1
     streams = f"import memmlp; print({{memmlp.Stream(path).network.fps for path in {made}}})"
     assert run(python, "-c", streams, folder=tmp_path) == "{60.0}\n"
     shown = run(python, "-c", "import memmlp; print(*dir(memmlp))", folder=tmp_path).split()

@@ -1,9 +1,7 @@
-"""`memmlp demo`: the whole pipeline on synthetic motion."""
+"""`memmlp demo`: a shipped network on a real clip, then a small ablation, in three minutes."""
 
 from __future__ import annotations
 
-import shutil
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,101 +9,123 @@ from typing import TYPE_CHECKING
 
 import click
 
+from memmlp.cli.options import outputs_option
 from memmlp.common.text_formats import join_command
+from memmlp.runs.lookup import DEFAULT
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
+    from memmlp.report.pictures.clip_pictures import ClipPiece
+    from memmlp.runs.run import Run
+    from memmlp.sweep.plan import Plan
 
-    from memmlp.training.request import Outcome
-
-NETWORKS = ("Mem-MLP", "RecurrentPoser")
-RECURRENT_POSER = "model=recurrent_poser"
-LABELS = [word for name in NETWORKS for word in ("--label", name)]
+ABLATION = "demo"
+"""The sweep that the demo runs."""
 
 
 @click.command("demo")
 @click.argument("overrides", nargs=-1)
-def demo(overrides: tuple[str, ...]) -> None:
-    """Run synthetic motion -> VQ-VAE -> Mem-MLP -> metrics -> ONNX -> latency, in minutes, on the CPU.
+@outputs_option
+def demo(overrides: tuple[str, ...], outputs: Path) -> None:
+    """See a trained network on a real clip, then train and compare two small ones, in three minutes.
 
-    Then the demo trains RecurrentPoser, this project's own network, and compares both networks. OVERRIDES are
-    those of `memmlp train`, for example profile=tiny. The demo trains only one network if you choose a model,
-    or if RecurrentPoser does not support an override.
+    The ablation trains Mem-MLP with and without memory on synthetic motion, two seeds each. OVERRIDES are
+    those of `memmlp train`, for the ablation. A repeated demo continues an interrupted one.
     """
-    from memmlp.cli.train_summary import show_side_by_side
-    from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
-
-    started = time.monotonic()
-    both = is_valid_for_recurrent_poser(overrides)  # checked before the first network trains for minutes
-    outcomes = train_demo(overrides) + (train_demo([*overrides, RECURRENT_POSER]) if both else [])
-    if len(outcomes) == len(NETWORKS):
-        show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
-        for remark in dict.fromkeys(
-            filter(None, (warn_if_hardly_trained(count_training_frames(one.run)) for one in outcomes))
-        ):
-            click.echo(remark)
-    click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
-    click.echo(describe_next_steps(overrides, find_inactive_environment(), [one.run.id for one in outcomes]))
+    began = time.monotonic()
+    folder = outputs.absolute() / "demo"
+    folder.mkdir(parents=True, exist_ok=True)
+    show_clip(folder, began)
+    run = run_ablation(overrides, outputs.absolute())
+    export_network(run, outputs.absolute(), folder)
+    click.echo(f"\nthe demo took {time.monotonic() - began:.0f} s")
+    click.echo(describe_next_steps(overrides))
 
 
-def is_valid_for_recurrent_poser(overrides: Sequence[str]) -> bool:
-    """Return whether a demo with these overrides can also train RecurrentPoser.
+def show_clip(folder: Path, began: float) -> None:
+    """Draw a shipped network's prediction for the shipped clip beside the truth, and print where it is."""
+    from memmlp.report.pictures.clip_pictures import write_picture
+    from memmlp.runs.lookup import read_card
 
-    It can if the overrides do not choose a network and are valid with RecurrentPoser.
-    """
+    card, path = read_card(DEFAULT), folder / "clip.svg"
+    piece = predict_shipped_clip(card["title"])
+    write_picture(path, piece, 5)
+    click.echo(f"1. {card['title']} on {piece.title}: a real recording of a person who is in no training")
+    click.echo(f"   mean error of the 22 joints: {piece.errors[card['title']].mean():.1f} cm")
+    click.echo(f"   picture, after {time.monotonic() - began:.0f} s: {path}")
+    click.echo("   see it move: memmlp live")
+
+
+def predict_shipped_clip(label: str) -> ClipPiece:
+    """Return the shipped clip with the prediction of the network DEFAULT's ONNX file, frame by frame."""
+    from memmlp.deploy.onnx_stream import OnnxStream
+    from memmlp.deploy.parity import stream_onnx
+    from memmlp.evaluation.modes import extract_positions
+    from memmlp.motion.body import SPARSE_DIM, load_rest_joints
+    from memmlp.motion.motion_source import ShippedMotion
+    from memmlp.report.pictures.clip_pictures import ClipPiece
+    from memmlp.runs.lookup import find_shipped, find_shipped_clip
+
+    run, path = find_shipped(DEFAULT), find_shipped_clip()
+    assert run is not None
+    clip = ShippedMotion(path, load_rest_joints("builtin")).open("test").read_clip(0)
+    truth, motion = clip[:, SPARSE_DIM:], stream_onnx(OnnxStream(run.preferred_onnx), clip)
+    return ClipPiece(
+        path.stem, *(extract_positions(truth).numpy(), {label: extract_positions(motion).numpy()})
+    )
+
+
+def run_ablation(overrides: Sequence[str], outputs: Path) -> Run:
+    """Finish the demo's sweep, print its table, and return the first run of its control."""
+    from memmlp.cli.sweep import run_workers
+    from memmlp.cli.table import SHOWN_MODES, ShownSweep, make_plan_table, print_tables
+    from memmlp.cli.workers import Workers, split_executor
+    from memmlp.config.compose_plan import find_sweep, make_plan
+    from memmlp.report.tables.measured_run import load_measured_run
+
+    executor, settings, overrides = split_executor(overrides)
+    chosen = find_sweep(ABLATION, overrides)
+    click.echo("\n2. an ablation on synthetic motion: Mem-MLP with and without its memory, two seeds each")
+    plan = make_plan(chosen, outputs, prepare=True)
+    if plan.list_remaining():
+        run_workers(chosen, plan, Workers(executor, settings))
+    command = join_command(["memmlp", "sweep", ABLATION, *overrides])
+    shown = ShownSweep(chosen, plan, None)
+    found = make_plan_table(shown, SHOWN_MODES["stream"], command, load_measured_run)
+    print_tables([found.table])
+    return find_control_run(plan, chosen.control)
+
+
+def find_control_run(plan: Plan, control: str | None) -> Run:
+    """Return the run of the control's first seed. Raises InputError if a run of the sweep has failed."""
     from memmlp.common.errors import InputError
-    from memmlp.config.compose import compose_jobs, parse_hydra_arguments
 
-    if any(word.startswith(("model=", "experiment=", "-")) for word in overrides):
-        return False
-    try:
-        compose_jobs(parse_hydra_arguments(["data=synth", "profile=small", *overrides, RECURRENT_POSER]))
-    except InputError:
-        return False
-    return True
+    run = next(plan.get_run(entry) for entry in plan.entries if entry.label == control)
+    if not run.done:
+        raise InputError(f"run {run.id}: {run.fault or 'is not finished'}; memmlp sweep {ABLATION} --retry")
+    return run
 
 
-def train_demo(overrides: Sequence[str]) -> list[Outcome]:
-    """Finish the run with these overrides, then print and return its results."""
-    from memmlp.cli.train import run_training, train
+def export_network(run: Run, outputs: Path, folder: Path) -> None:
+    """Export a run to the folder, and print the file and the time of a step."""
+    from memmlp.cli.export import ExportForm, write_exact
+    from memmlp.config.open_run import open_run
+    from memmlp.deploy.latency import measure_step_times
 
-    outcomes: list[Outcome] = []
-
-    def job(cfg: DictConfig) -> None:
-        if outcome := run_training(cfg):
-            outcomes.append(outcome)
-
-    train(["data=synth", "profile=small", *overrides], job)
-    return outcomes
-
-
-def describe_next_steps(
-    overrides: Sequence[str], environment: Path | None = None, runs: Sequence[str] = ()
-) -> str:
-    """Return commands that the user can try next, as a text.
-
-    Args:
-        overrides: the demo's overrides, to repeat in the commands.
-        environment: the folder of a virtual environment to activate first; None if none is needed.
-        runs: ids of the demo's runs. With two ids, the first command draws the motion of both networks.
-    """
-    command = join_command(["memmlp", "train", *overrides, "memory=none"])
-    kept = [word for word in overrides if word.startswith(("profile=", "threads=", "device="))]
-    lines = [
-        f"{command}          the same network without its memory; then memmlp runs list",
-        "memmlp data import BVH_FOLDER --out outputs/data/mine",
-        join_command(["memmlp", "train", *kept, "data=mocap", "data.root=outputs/data/mine"]),
-    ]
-    if len(runs) > 1:
-        lines.insert(0, join_command(["memmlp", "render", *runs, *LABELS, "--to", "3", "--out", "both.gif"]))
-    if environment:
-        lines.insert(0, join_command(["source", str(environment / "bin" / "activate")]))
-    return "next: " + "\n      ".join(lines)
+    file = folder / "mem_mlp.onnx"
+    line = write_exact(open_run(outputs, run.id), file, ExportForm("auto", "fp32", 18, None))
+    times = measure_step_times(file)
+    click.echo(f"\n3. Mem-MLP as ONNX: {file} ({file.stat().st_size / 1e6:.1f} MB, {line})")
+    click.echo(f"   a frame on one core: {times['median_ms']:.2f} ms median, {times['p95_ms']:.2f} ms p95")
 
 
-def find_inactive_environment() -> Path | None:
-    """Return the folder of this Python's virtual environment, or None if the shell has activated it."""
-    here = Path(sys.prefix)
-    path = shutil.which("memmlp")
-    inside = path is not None and Path(path).parent == here / "bin"
-    return None if inside or not (here / "bin" / "activate").exists() else here
+def describe_next_steps(overrides: Sequence[str]) -> str:
+    """Return three commands that the user can try next, as a text."""
+    sweep = join_command(["memmlp", "sweep", ABLATION, *overrides, "seed=0,1,2,3,4"])
+    return "\n  ".join(
+        [
+            "next:",
+            "memmlp live  # the network of part 1, moving in the browser",
+            f"{sweep}  # more seeds, for narrower intervals",
+            "memmlp data import BVH_FOLDER --out outputs/data/mine  # your own recordings",
+        ]
+    )

@@ -39,9 +39,10 @@ def evaluate(
 ) -> None:
     """Show the metrics of a finished run on its test clips.
 
-    RUN is an id, the beginning of an id, or a folder. OVERRIDES are keys of the evaluation or the export,
-    such as evaluation.ik=lbfgs, evaluation.modes=[stream] or export.precision=int8. Missing results are
-    measured without training.
+    RUN is an id, the beginning of an id, a folder, or a shipped network (memmlp models). OVERRIDES are keys
+    of the evaluation or the export, such as evaluation.ik=lbfgs, evaluation.modes=[stream] or
+    export.precision=int8. Missing results are measured without training. To measure a shipped network, set
+    data.root to the folder of its data.
     """
     check_runs_exist(outputs, run)
     if json_path is not None and not json_path.absolute().parent.is_dir():
@@ -53,12 +54,22 @@ def evaluate(
     from memmlp.common.text_formats import make_console
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
-    from memmlp.training.request import read_clip_rows
+    from memmlp.motion.motion_source import PreparedMotion
+    from memmlp.runs.lookup import copy_shipped, find_run, find_shipped
+    from memmlp.training.request import read_clip_rows, read_results
     from memmlp.training.run_stages import complete_stages
 
+    found = find_run(outputs, run)
+    if find_shipped(run):
+        run = str(copy_shipped(found, outputs).folder)
     opened = open_run(outputs, run, device, overrides)
     experiment = opened.experiment
-    results, stages = complete_stages(experiment, opened.run, opened.data, again=again)
+    if isinstance(opened.data, PreparedMotion):
+        results, stages = complete_stages(experiment, opened.run, opened.data, again=again)
+    elif again or not all(map(opened.run.has, experiment.stage_ids)):
+        raise InputError(f"{found.id}: measuring needs its data; set data.root=FOLDER (memmlp models)")
+    else:
+        results, stages = read_results(experiment, opened.run), []
     outcome = f"{' and '.join(stages)} done" if stages else "measured before"
     click.echo(f"run {opened.run.id}: {outcome}")
     facts = [opened.run.manifest.get(fact) for fact in ("resampled", "unusual")]

@@ -25,6 +25,7 @@ from memmlp.cli.options import (
     plugins_option,
     token_option,
 )
+from memmlp.runs.lookup import DEFAULT, find_shipped, find_shipped_clip, get_shipped_name
 
 if TYPE_CHECKING:
     from memmlp.live.outputs import Output, Outputs
@@ -74,10 +75,11 @@ class LiveOptions(NamedTuple):
 
 
 @click.command("live")
-@click.argument("network", metavar="RUN|FILE.onnx")
+@click.argument("network", metavar="[RUN|FILE.onnx]", default=DEFAULT)
 @click.option(
     "--clip",
-    help="Clip to play: a test clip's name, or an AMASS npz file.  [default: the run's first test clip]",
+    help="Clip to play: a test clip's name, or an AMASS npz file.  [default: the run's first test clip; the "
+    "shipped clip for shipped networks and ONNX files]",
 )
 @click.option(
     "--udp", type=PORT, metavar="PORT", help="Receive tracker poses as JSON packets at this UDP port."
@@ -156,11 +158,11 @@ class LiveOptions(NamedTuple):
 @plugins_option
 @outputs_option
 def live(**options: Any) -> None:
-    """Show a finished run or an ONNX file live, on a local web page.
+    """Show a network live, on a local web page; by default a shipped network on a shipped clip.
 
-    RUN is an id, the beginning of an id, or a folder. The input is a repeated clip in real time, or tracker
-    poses from network packets. The page shows the body; options also send it to other programs and files
-    (docs/guides/live.md). Ctrl-C stops the command.
+    RUN is an id, the beginning of an id, a folder, or a shipped network (memmlp models). The input is a
+    repeated clip in real time, or tracker poses from network packets. The page shows the body; options also
+    send it to other programs and files (docs/guides/live.md). Ctrl-C stops the command.
     """
     live_options = LiveOptions(**options)
     check_options(live_options)
@@ -209,20 +211,21 @@ def make_source(options: LiveOptions) -> TrackerSource:
 
 def load_tracked_clip(options: LiveOptions) -> TrackedClip:
     """Load the clip of --clip: an AMASS npz file on the network's body, or a test clip of the run. Raises
-    InputError for an unknown test clip, or for a test clip of an ONNX file."""
+    InputError for an unknown test clip, or for a test clip of an ONNX file or a shipped network."""
     from memmlp.common.errors import InputError
-    from memmlp.deploy.onnx_stream import check_file
     from memmlp.live.session.sources import TrackedClip, read_npz_frames
     from memmlp.live.stream import ExportedNetwork
 
-    if options.clip is not None and options.clip.endswith(".npz"):
+    clip = options.clip
+    if options.is_onnx_file or find_shipped(options.network):
+        clip = clip or str(find_shipped_clip())
+        if not clip.endswith(".npz"):
+            raise InputError(
+                f"--clip {clip}: must be an npz file, because {options.network} has no test clips"
+            )
+    if clip is not None and clip.endswith(".npz"):
         body = ExportedNetwork(find_network_file(options)[0]).body.rest
-        return TrackedClip(Path(options.clip).stem, read_npz_frames(Path(options.clip), body))
-    if options.is_onnx_file:
-        check_file(Path(options.network))
-        raise InputError(
-            f"{options.network}: needs --clip FILE.npz, --udp or --osc, because ONNX files have no test clips"
-        )
+        return TrackedClip(Path(clip).stem, read_npz_frames(Path(clip), body))
     if sys.stderr.isatty():  # it takes seconds
         print_note(f"opening run {options.network} and its test clips")
     from memmlp.config.open_run import find_clip_index, open_run
@@ -285,7 +288,7 @@ def find_network_file(options: LiveOptions) -> tuple[Path, str]:
     if options.is_onnx_file:
         return Path(options.network), Path(options.network).name
     run = find_run(options.outputs, options.network)
-    return run.preferred_onnx, f"run {run.id[:8]}"
+    return run.preferred_onnx, get_shipped_name(run) or f"run {run.id[:8]}"
 
 
 def combine_calibration(options: LiveOptions, space: SpaceName, stream: Stream) -> Calibration:

@@ -47,6 +47,7 @@ COMMANDS = {
     "predict": Command("predict", "predict", "Write a network's predictions for clips as BVH, glTF or npz."),
     "render": Command("render", "render", "Draw runs beside the ground truth as figures or films."),
     "live": Command("live", "live", "Show a network live on a local page, driven by a clip or trackers."),
+    "models": Command("models", "models", "List the trained networks that the package ships."),
     "web": Command("web", "web", "Make a site that runs networks in any browser."),
     "export": Command("export", "export", "Write the ONNX file of a finished run."),
     "bench": Command("bench", "bench", "Measure speed on this machine."),

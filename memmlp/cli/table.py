@@ -224,8 +224,9 @@ def make_plan_table(
 
 def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
     """Find the sweeps with a name and overrides; return each sweep with its command."""
+    from memmlp.common.files import find_packaged_folder
     from memmlp.config.compose_plan import find_sweep
-    from memmlp.config.plugins import find_packaged_folder, format_config_dir
+    from memmlp.config.plugins import format_config_dir
 
     tables = sorted(path.stem for path in find_packaged_folder("sweeps").glob("table*.yaml"))
     return [

@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import parse_overrides
 from memmlp.config.check import explain_error
 from memmlp.config.compose import (
@@ -25,7 +26,6 @@ from memmlp.config.compose import (
     format_hydra_arguments,
     parse_hydra_arguments,
 )
-from memmlp.config.plugins import find_packaged_folder
 
 if TYPE_CHECKING:
     from memmlp.training.request import Outcome

@@ -235,7 +235,7 @@ def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
 
 def write_results(setup: SearchSetup, study: Study) -> None:
     """Write the results of the search into its folder."""
-    from memmlp.config.plugins import find_packaged_folder
+    from memmlp.common.files import find_packaged_folder
     from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")

@@ -15,7 +15,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import memmlp
 from memmlp.common.lease import publish, temporary_path
+
+
+def find_packaged_folder(name: str) -> Path:
+    """Return the shipped folder `conf`, `sweeps` or `models`.
+
+    In a checkout, it is beside the package folder. In an installation, it is `_conf`, `_sweeps` or `_models`
+    inside the package folder.
+    """
+    package = Path(memmlp.__file__).resolve().parent
+    installed = package / f"_{name}"
+    return installed if installed.is_dir() else package.parent / name
 
 
 def now() -> str:

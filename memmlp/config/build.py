@@ -25,6 +25,7 @@ from memmlp.common.components import (
     find_component,
 )
 from memmlp.common.errors import InputError
+from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import flatten, format_value
 from memmlp.common.text_formats import escape_interpolations
 from memmlp.config import plugins
@@ -32,7 +33,6 @@ from memmlp.config.build_request import build_request, read_source_weights
 from memmlp.config.check import check
 from memmlp.config.component_source import register_components
 from memmlp.config.compose import VERSION_BASE, compose_config
-from memmlp.config.plugins import find_packaged_folder
 from memmlp.config.schema import restore_config
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK

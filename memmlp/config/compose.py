@@ -26,13 +26,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.components import SLOTS, collect_attribute, collect_components, list_component_names
 from memmlp.common.errors import InputError
+from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import Override, flatten, parse_overrides, select_last_by_key
 from memmlp.common.settings import Settings
 from memmlp.common.text_formats import expand_home, join_command, make_override
 from memmlp.config import plugins
 from memmlp.config.check import check, describe_unknown_key, explain_error
 from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register_components
-from memmlp.config.plugins import find_packaged_folder
 from memmlp.config.schema import Config
 
 VERSION_BASE = "1.3"

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import digest
+from memmlp.common.files import digest, find_packaged_folder
 from memmlp.common.overrides import Override
 from memmlp.common.text_formats import escape_interpolations
-from memmlp.config.plugins import activate, find_named_packages, find_packaged_folder
+from memmlp.config.plugins import activate, find_named_packages
 from memmlp.sweep.definition import Sweep, Variant, parse_key, save_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
 from memmlp.sweep.sweep_file import load_sweep

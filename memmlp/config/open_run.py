@@ -12,11 +12,12 @@ from torch import Tensor
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import parse_overrides
 from memmlp.config.build import build_experiment, load_config
+from memmlp.motion.body import load_rest_joints
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.motion_source import PreparedMotion
+from memmlp.motion.motion_source import PreparedMotion, ShippedMotion
 from memmlp.networks.motion_model import MotionModel
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, select_training_config
-from memmlp.runs.lookup import find_run
+from memmlp.runs.lookup import find_run, find_shipped_clip, get_shipped_name
 from memmlp.runs.run import Run
 from memmlp.training.devices import choose_device
 from memmlp.training.run_stages import Experiment
@@ -30,7 +31,7 @@ class OpenedRun(NamedTuple):
 
     run: Run
     experiment: Experiment
-    data: PreparedMotion
+    data: PreparedMotion | ShippedMotion
 
     @property
     def test(self) -> MotionDataset:
@@ -57,12 +58,17 @@ def open_existing_run(run: Run) -> OpenedRun:
     return OpenedRun(run, experiment, load_run_data(run, experiment))
 
 
-def load_run_data(run: Run, experiment: Experiment) -> PreparedMotion:
-    """Return the prepared data of a run. Raises InputError if the data has changed since the training."""
+def load_run_data(run: Run, experiment: Experiment) -> PreparedMotion | ShippedMotion:
+    """Return the prepared data of a run. Raises InputError if the data has changed since the training.
+
+    For a shipped network without data.root=FOLDER, the data is the shipped clip.
+    """
+    root = experiment.config["data"]["root"]
+    if get_shipped_name(run) and root == run.config["data"]["root"] and not Path(root).exists():
+        return ShippedMotion(find_shipped_clip(), load_rest_joints(str(experiment.motion.clips.body)))
     # Clips of the list may be missing, as long as the digest matches the training data.
     data = replace(experiment.motion, partial=True).prepare()
     if data.digest != run.manifest["data"]:
-        root = experiment.motion.clips.root
         raise InputError(f"run {run.id}: its data has changed since the training (data.root={root})")
     return data
 

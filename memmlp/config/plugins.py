@@ -28,9 +28,9 @@ from typing import Any
 
 import yaml
 
-import memmlp
 from memmlp.common.components import SLOTS, Component, add_package, collect_components, find_component
 from memmlp.common.errors import InputError
+from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import parse_overrides
 from memmlp.common.settings import MetricSettings
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
@@ -205,14 +205,6 @@ def import_object(path: str, key: str) -> Any:
 
 
 DEFAULT_GROUPING = "cmu"  # the grouping of data=mocap
-
-
-def find_packaged_folder(name: str) -> Path:
-    """Return the shipped folder `conf` or `sweeps`: beside the package in a checkout, else `_conf` or
-    `_sweeps` in it."""
-    package = Path(memmlp.__file__).resolve().parent
-    installed = package / f"_{name}"
-    return installed if installed.is_dir() else package.parent / name
 
 
 def choose_grouping(names: Collection[str]) -> str | None:

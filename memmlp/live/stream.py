@@ -27,6 +27,7 @@ from memmlp.live.tracker_resampling import (
 )
 from memmlp.live.wearer import TILTED, Offsets, check_offsets, make_wearer
 from memmlp.motion.body import FEATURES
+from memmlp.runs.lookup import find_shipped
 from memmlp.runs.run import Run
 
 if TYPE_CHECKING:
@@ -145,7 +146,8 @@ class Stream:
     other rates than 60 Hz, of lost trackers and of gaps.
 
     Args:
-        source: a finished run, its folder, or an ONNX file from `memmlp export --scope step`.
+        source: the name of a shipped network (`memmlp models`), a finished run, its folder, or an ONNX file
+            from `memmlp export --scope step`.
         space: frame of reference of inputs and outputs: amass, openxr or unity.
         rotations: format of the output rotations: matrix or quaternion (xyzw).
         offsets: offsets from the devices to the joints; None for zero offsets.
@@ -178,8 +180,10 @@ class Stream:
         if rotations not in ROTATION_FORMATS:
             raise InputError(f"rotations={rotations}: must be one of {', '.join(ROTATION_FORMATS)}")
         if not isinstance(source, Run | str | PathLike) or not str(source):
-            raise InputError(f"source={source!r}: must be a run, its folder, or an ONNX file")
+            raise InputError(f"source={source!r}: must be a run, its folder, an ONNX file or a shipped name")
         run = source if isinstance(source, Run) else Run(Path(source))
+        if not run.folder.exists():
+            run = find_shipped(str(source)) or run
         self.network = ExportedNetwork(run.preferred_onnx if run.folder.is_dir() else run.folder)
         if ik is not None and not self.network.has_position_branch:
             raise InputError(f"ik: must be None; {self.network.path} does not have a position branch")
@@ -194,6 +198,10 @@ class Stream:
         self._features = FeatureWriter()
         self._sparse = self.network.sparse[0]  # the network's input array; written before each step
         self._last: BodyFrame | None = None
+
+    def __repr__(self) -> str:
+        height = self.wearer.height
+        return f"Stream({str(self.network.path)!r}, {self.network.fps:g} Hz, height {height:.2f} m)"
 
     @property
     def rest(self) -> np.ndarray:

@@ -9,9 +9,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock, publish, temporary_path
-from memmlp.motion.preparing.cache import ClipFolder, load_finished_cache, prepare_cache
+from memmlp.motion.clip import resample
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.preparing.cache import (
+    ClipFolder,
+    compute_frame_blocks,
+    load_finished_cache,
+    prepare_cache,
+)
 from memmlp.motion.preparing.find_clips import find_clips, get_clip_name
 from memmlp.motion.preparing.manifest import Coverage, Manifest
 
@@ -46,6 +55,31 @@ class PreparedMotion(NamedTuple):
                 "restore the clips"
             )
         return part_of_cache
+
+
+@dataclass(frozen=True)
+class ShippedMotion:
+    """One clip as the test clips of a shipped network, for use without the network's data.
+
+    Attributes:
+        clip: an AMASS npz file.
+        rest: rest joints (22, 3) of the network's body, metres.
+    """
+
+    clip: Path
+    rest: np.ndarray
+
+    def open(self, part: str) -> MotionDataset:
+        """Return the clip as a dataset. Raises InputError for another part than "test"."""
+        import torch
+
+        from memmlp.motion.dataset import MotionDataset
+
+        if part != "test":
+            raise InputError(f"{self.clip}: needs the network's data; set data.root=FOLDER")
+        clip, _ = resample(read_clip(self.clip, self.clip.stem))
+        frames = torch.from_numpy(np.concatenate(list(compute_frame_blocks(clip, self.rest))))
+        return MotionDataset(frames, torch.tensor([0]), torch.tensor([len(frames)]), [clip.name])
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import write_json
+from memmlp.common.files import find_packaged_folder, write_json
 from memmlp.runs import records
 from memmlp.runs.identity import ID, NETWORK
 from memmlp.runs.run import Run
@@ -27,11 +29,13 @@ def list_runs(outputs: Path | str) -> list[Run]:
 
 
 def find_run(outputs: Path | str, name: str) -> Run:
-    """Find a run by its id, the first digits of its id, or its folder. Raises InputError unless one run
-    matches."""
+    """Find a run by its id, the first digits of its id, its folder, or the name of a shipped network. Raises
+    InputError unless one run matches."""
     is_folder = bool(name) and (Path(name) / "manifest.json").is_file()
     if is_folder and ("/" in name or not ID.fullmatch(name)):
         return Run(Path(name).resolve())
+    if not is_folder and (shipped := find_shipped(name)):
+        return shipped
     runs = list_runs(outputs)
     matches = sorted(run.id for run in runs if name and run.id.startswith(name))
     if len(matches) == 1:
@@ -43,7 +47,8 @@ def find_run(outputs: Path | str, name: str) -> Run:
         return Run(Path(name).resolve())
     where = Path(outputs) / "runs"
     raise InputError(
-        f"run '{name}': must be a run's folder, or the first digits of one of {len(runs)} run ids in {where}"
+        f"run '{name}': must be a run's folder, the first digits of one of {len(runs)} run ids in {where}, "
+        f"or a shipped network ({', '.join(list_shipped())})"
     )
 
 
@@ -152,3 +157,50 @@ def _check_tag(tag: str) -> str:
 def _write_notes(run: Run, notes: Notes) -> Notes:
     write_json(get_notes_path(run), {"tags": list(notes.tags), "note": notes.note})
     return notes
+
+
+# The package ships networks and a clip in its folder `models`. A shipped network is a finished run without
+# checkpoints. Its folder has the network's name, and `card.json` describes it. Commands only read the folder.
+
+CARD = "card.json"
+DEFAULT = "recurrent_poser"
+"""The network of commands without a network."""
+
+
+def list_shipped() -> list[str]:
+    """Return the names of the shipped networks."""
+    return sorted(path.parent.name for path in find_packaged_folder("models").glob(f"*/{CARD}"))
+
+
+def find_shipped(name: str) -> Run | None:
+    """Return the run of a shipped network; None for other names."""
+    return Run(find_packaged_folder("models") / name) if name in list_shipped() else None
+
+
+def get_shipped_name(run: Run) -> str | None:
+    """Return the network's name of a shipped run or its copy; None for other runs."""
+    return run.manifest.get("shipped")
+
+
+def find_shipped_clip() -> Path:
+    """Return the shipped clip, an AMASS npz file of a test person. Raises InputError if it is missing."""
+    for path in sorted((find_packaged_folder("models") / "clip").glob("*.npz")):
+        return path
+    raise InputError(f"{find_packaged_folder('models') / 'clip'}: has no clip; install memmlp again")
+
+
+def read_card(name: str) -> dict[str, Any]:
+    """Return the card of a shipped network."""
+    card: dict[str, Any] = json.loads((find_packaged_folder("models") / name / CARD).read_text("utf-8"))
+    return card
+
+
+def copy_shipped(run: Run, outputs: Path) -> Run:
+    """Copy a shipped run to the folder `models` in `outputs`, unless it was copied before.
+
+    New results are written to the copy.
+    """
+    copy = Run(outputs / "models" / run.id)
+    if copy.weights_digest != run.weights_digest:
+        shutil.copytree(run.folder, copy.folder, dirs_exist_ok=True)
+    return copy

@@ -75,7 +75,7 @@ Manifest = _record(
     attempts=list[Attempt],  # type: ignore[valid-type]
     seconds=dict[str, float] | None, forgiven=int, stages=list[Name],
     steps=int | None, best_step=int | None, tflop=float | None, source_bytes=dict[str, str],
-    **dict.fromkeys(("partial", "divided", "resampled", "unusual"), str | None),
+    shipped=str, **dict.fromkeys(("partial", "divided", "resampled", "unusual"), str | None),
 )  # fmt: skip
 Marker = _record(id=str, finished=Time, artifacts=dict[Name, str])
 Failure = _record(reason=str, when=Time, details=str)

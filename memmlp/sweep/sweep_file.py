@@ -33,7 +33,7 @@ import yaml
 
 from memmlp.common.errors import InputError, describe_read_error, escape_line_breaks
 from memmlp.common.overrides import format_value
-from memmlp.common.plain_yaml import parse_yaml
+from memmlp.common.schema import parse_config_yaml
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.sweep.definition import (
     BRANCHES,
@@ -71,7 +71,7 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
             f"most {MAX_NAME_BYTES} bytes long; rename the sweep file"
         )
     try:
-        content = parse_yaml(path.read_text(encoding="utf-8"))
+        content = parse_config_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: {describe_read_error(error)}; expected a readable sweep file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -1,47 +1,38 @@
-"""`memmlp demo` says what it does where no terminal shows progress bars."""
+"""`memmlp demo`: a picture of a shipped network, then an ablation, without a terminal."""
 
-import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
-from command_line import BRIEF
 
-from memmlp.cli.demo import describe_next_steps, find_inactive_environment, is_valid_for_recurrent_poser
+from memmlp.cli.demo import describe_next_steps, predict_shipped_clip
+from memmlp.deploy.onnx_stream import OnnxStream
+from memmlp.runs.lookup import DEFAULT, read_card
+
+TINY = [
+    "executor=debug", "profile=tiny", "data.synth.minutes=1", "optim.steps=2", "vqvae.steps=2",
+    "optim.validate_every=2", "threads=1",
+]  # fmt: skip
 
 
 @pytest.mark.slow
-def test_two_networks_side_by_side(memmlp):
-    ran = memmlp("demo", *BRIEF, "evaluation.modes=[stream]", "export.graph=off")
-    assert ran.code == 0
-    stages = [line.partition(":")[0] for line in ran.err.splitlines()]  # without a terminal for bars
-    assert stages == ["data", "VQ-VAE", "network", "evaluation", "data", "network", "evaluation"]
-    heads = [line.split() for line in ran.out.splitlines()]
-    first = heads.index(["Mem-MLP", "Mem-MLP"])
-    assert heads[first + 1] == ["metric", "unit", "rotation", "position", "RecurrentPoser"]
-    assert "the demo took" in ran.out
-    assert "--label Mem-MLP --label RecurrentPoser" in ran.out.partition("next: ")[2]
+def test_the_demo_ends_with_a_table_and_a_file(memmlp, tmp_path: Path):
+    ran = memmlp("demo", *TINY, "--outputs", str(tmp_path))
+    assert ran.code == 0, ran.err
+    assert [line[:2] for line in ran.out.splitlines() if line[:1].isdigit()] == ["1.", "2.", "3."]
+    assert "Without memory" in ran.out
+    assert f"{read_card(DEFAULT)['clip']['errors']['rotation']['MPJPE']:.1f} cm" in ran.out
+    picture = ElementTree.parse(tmp_path / "demo" / "clip.svg")
+    assert picture.getroot().tag.endswith("svg")
+    assert OnnxStream(tmp_path / "demo" / "mem_mlp.onnx").inputs["sparse"].shape == (1, 54)
 
 
-def test_overrides_that_recurrent_poser_cannot_take_are_known_before_training():
-    assert is_valid_for_recurrent_poser(["vqvae.steps=7", "optim.steps=500"])
-    for words in (
-        ["memory=none"], ["evaluation.ik=lbfgs"], ["model=avatar_poser"], ["experiment=no_memory"],
-    ):  # fmt: skip
-        assert not is_valid_for_recurrent_poser(words), words
+def test_the_first_picture_has_the_errors_of_the_card():
+    piece = predict_shipped_clip("shipped")
+    expected = read_card(DEFAULT)["clip"]["errors"]["rotation"]["MPJPE"]
+    assert piece.errors["shipped"].mean() == pytest.approx(expected, rel=0.01)
+    assert (piece.errors["shipped"] <= piece.top).mean() > 0.97
 
 
-def test_next_steps_enter_the_environment_and_repeat_the_overrides(tmp_path: Path, monkeypatch):
-    folder = tmp_path / ".venv"
-    (folder / "bin").mkdir(parents=True)
-    for name in ("activate", "memmlp"):
-        (folder / "bin" / name).touch(mode=0o755)
-    monkeypatch.setattr(sys, "prefix", str(folder))
-    monkeypatch.setenv("PATH", "")
-    assert find_inactive_environment() == folder
-    enter, first, _, own = describe_next_steps(["profile=tiny", "seed=1", "threads=1"], folder).splitlines()
-    assert enter == f"next: source {folder}/bin/activate"
-    assert first.split()[:6] == ["memmlp", "train", "profile=tiny", "seed=1", "threads=1", "memory=none"]
-    data = ["data=mocap", "data.root=outputs/data/mine"]
-    assert own.split() == ["memmlp", "train", "profile=tiny", "threads=1", *data]
-    monkeypatch.setenv("PATH", str(folder / "bin"))
-    assert find_inactive_environment() is None
+def test_next_steps_repeat_the_overrides():
+    assert "memmlp sweep demo optim.steps=7 seed=0,1,2,3,4" in describe_next_steps(["optim.steps=7"])

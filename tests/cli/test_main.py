@@ -15,7 +15,7 @@ from processes import finished
 import memmlp as package
 from memmlp.cli.main import COMMANDS, main
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.config.plugins import find_packaged_folder
+from memmlp.common.files import find_packaged_folder
 
 
 def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

@@ -1,8 +1,8 @@
-from memmlp.common.plain_yaml import parse_yaml
+from memmlp.common.schema import parse_config_yaml
 
 
 def test_values_are_those_of_the_command_line():
-    content = parse_yaml(
+    content = parse_config_yaml(
         "{a: [off, on, 010, 12:30, 1_000, 2024-01-01, 0x10, 'true'], b: [1e-3, 5, -.5, true, null, ~]}"
     )
     assert content["a"] == ["off", "on", "010", "12:30", "1_000", "2024-01-01", "0x10", "true"]
@@ -10,6 +10,6 @@ def test_values_are_those_of_the_command_line():
 
 
 def test_labels_are_text_as_written():
-    content = parse_yaml("{off: 1, 010: 2, 12:30: 3, 1.50: 4, true: 5, control: 1.50, against: null}")
+    content = parse_config_yaml("{off: 1, 010: 2, 12:30: 3, 1.50: 4, true: 5, control: 1.50, against: null}")
     assert [*content] == ["off", "010", "12:30", "1.50", "true", "control", "against"]
     assert (content["control"], content["against"]) == ("1.50", None)

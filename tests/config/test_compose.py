@@ -8,9 +8,9 @@ from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.components import SLOTS, list_component_names
+from memmlp.common.files import find_packaged_folder
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import _initialize_hydra, compose_config, compose_jobs, parse_hydra_arguments
-from memmlp.config.plugins import find_packaged_folder
 
 OF_TERMS = [path.stem for path in find_packaged_folder("conf").glob("loss/*.yaml")]
 

@@ -20,10 +20,9 @@ from own_package import registers_kept
 from PIL import Image
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.common.files import file_digest
+from memmlp.common.files import file_digest, find_packaged_folder
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import compose_config
-from memmlp.config.plugins import find_packaged_folder
 from memmlp.motion.dataset import MotionDataset
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.runs import environment

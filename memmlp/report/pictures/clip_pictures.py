@@ -19,6 +19,7 @@ from memmlp.motion.body import FPS, LIMBS, RADII, ROOT
 from memmlp.report.pictures.drawing import (
     ELEVATION,
     NEUTRAL,
+    PANEL,
     Camera,
     draw_skeleton,
     encode_png,
@@ -26,6 +27,9 @@ from memmlp.report.pictures.drawing import (
     get_pixels,
     make_heat_colours,
     make_panels,
+    write_colour_scale,
+    write_skeleton,
+    write_text,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.text import Text
 
-SUFFIXES = (".png", ".gif", ".mp4")
+SUFFIXES = (".svg", ".png", ".gif", ".mp4")
 POSES = 6  # default number of poses
 RATE = 30  # pictures per second
 TICKS = (30, 30, 40)  # durations of GIF pictures in turn, ms: multiples of 10, on average 30 per second
@@ -152,25 +156,33 @@ def check_picture_path(path: Path, key: str = "path", suffixes: tuple[str, ...] 
         raise InputError(f"{key} {path}: must end in {', '.join(suffixes)}")
     if not path.parent.is_dir():
         raise InputError(f"{key} {path}: there is no folder {path.parent}")
-    import_optional("matplotlib", "plots", key)
+    if path.suffix.lower() != ".svg":
+        import_optional("matplotlib", "plots", key)
     if path.suffix.lower() == ".mp4":
         import_optional("av", "video", key)
 
 
 def write_picture(path: Path, piece: ClipPiece, poses: int = POSES, key: str = "path") -> None:
-    """Write a PNG of `poses` poses, or a GIF or MP4 of all frames, completely or not at all.
+    """Write a PNG or SVG of `poses` poses, or a GIF or MP4 of all frames, completely or not at all.
 
     Raises:
         InputError: if the file can't be written, or PyAV is not installed for an MP4.
     """
     suffix = path.suffix.lower()
     try:
-        if suffix == ".png":
+        if suffix == ".svg":
+            atomic_write(path, encode_svg(piece, poses))
+        elif suffix == ".png":
             atomic_write(path, encode_png(draw_poses(piece, poses)))
         else:
             atomic_write(path, {".gif": encode_gif, ".mp4": encode_mp4}[suffix](draw_film(piece)))
     except OSError as error:
         raise InputError(f"{key} {path}: {error.strerror or error}") from None
+
+
+def select_frames(piece: ClipPiece, poses: int) -> list[int]:
+    """Return the frames of `poses` poses, evenly spaced in a piece."""
+    return [int(frame) for frame in np.linspace(0, len(piece.truth) - 1, poses + 2).round()[1:-1]]
 
 
 def draw_poses(piece: ClipPiece, poses: int = POSES) -> Figure:
@@ -181,7 +193,7 @@ def draw_poses(piece: ClipPiece, poses: int = POSES) -> Figure:
     """
     labels = ["truth", *piece.predictions]
     figure, panels = make_panels(150 + 230 * poses, 60 + 360 * len(labels), len(labels), poses)
-    frames = np.linspace(0, len(piece.truth) - 1, poses + 2).round().astype(int)[1:-1].tolist()
+    frames = select_frames(piece, poses)
     for column, frame in zip(panels.T, frames, strict=True):
         column[0].set_title(f"{piece.find_seconds(frame):.2f} s")
         _write_errors(column[1:], piece, frame)
@@ -192,6 +204,31 @@ def draw_poses(piece: ClipPiece, poses: int = POSES) -> Figure:
         camera = piece.make_camera(piece.find_azimuth(frame), piece.truth[frame, 0, :2])
         _draw_skeletons(column, piece, frame, camera)
     return figure
+
+
+def encode_svg(piece: ClipPiece, poses: int = POSES) -> str:
+    """Encode the figure of `draw_poses` as SVG, which does not need matplotlib."""
+    labels, frames = ["truth", *piece.predictions], select_frames(piece, poses)
+    width, height = 70 + PANEL[0] * poses, 56 + PANEL[1] * len(labels)
+    parts = [write_text(12, 30, piece.title, 18, "bold")]
+    for row, label in enumerate(labels):
+        y = 56 + PANEL[1] * row
+        parts.append(write_text(12, y + 40, label, 15, "bold"))
+        for column, frame in enumerate(frames):
+            camera = piece.make_camera(piece.find_azimuth(frame), piece.truth[frame, 0, :2])
+            joints, errors = piece.list_skeletons(frame)[row]
+            x = 40 + PANEL[0] * column
+            parts.append(f'<svg x="{x}" y="{y}" width="{PANEL[0]}" height="{PANEL[1]}">')
+            parts.append(write_skeleton(camera, joints, errors, piece.floor) + "</svg>")
+            note = f"{piece.find_seconds(frame):.2f} s"
+            if row:
+                note = f"{piece.errors[label][frame].mean():.1f} cm"
+            parts.append(write_text(x + PANEL[0] / 2, y + PANEL[1] - 8, note, 13, anchor="middle"))
+    parts.append(write_colour_scale(width - 150, 14, piece.top))
+    size = f'width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
+    style = 'font-family="sans-serif" fill="#222"'
+    background = '<rect width="100%" height="100%" fill="#fff"/>'
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size} {style}>{background}{"".join(parts)}</svg>\n'
 
 
 def draw_film(piece: ClipPiece) -> Iterator[np.ndarray]:

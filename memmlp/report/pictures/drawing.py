@@ -1,9 +1,11 @@
-"""Skeletons drawn with matplotlib: round limbs, coloured by error, over a floor in a parallel projection."""
+"""Skeletons with limbs coloured by error, in a parallel projection, drawn with matplotlib or as SVG."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from html import escape
 from io import BytesIO
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,12 +19,15 @@ if TYPE_CHECKING:
 
 DPI = 100
 NEUTRAL = (0.66, 0.70, 0.74)  # the truth's colour
+NEUTRAL_HEX = "#a8b2bd"
 ELEVATION = np.deg2rad(12)  # angle by which a camera looks down, radians
 DISCS = 24  # number of discs along a limb
 TONES = np.linspace(0, 1, 6)  # from a limb's dark edge to its highlight
 LIGHT = np.array([-0.28, 0.40])  # offset of the highlight to the right and up, in radii
 GRID, STEP = 0.5, 0.1  # distance between the floor's lines, and length of their pieces, metres
 FLOOR = 0.56  # radius of the visible floor as a fraction of the picture's width
+PANEL = (190, 300)  # width and height of a pose in an SVG, pixels
+PIECES = 5  # pieces of a limb in an SVG, each in one colour
 SHADOW = 0.16  # radius of a limb's shadow, metres
 
 
@@ -177,3 +182,63 @@ def _add_ellipses(axes: Axes, places: np.ndarray, sizes: np.ndarray, colours: An
     shape: dict[str, Any] = {"units": "xy", "offsets": places[finite], "offset_transform": axes.transData}
     colours = np.asarray(colours)[finite]
     axes.add_collection(EllipseCollection(widths, heights, 0, facecolors=colours, linewidths=0, **shape))
+
+
+def write_skeleton(camera: Camera, joints: np.ndarray, errors: np.ndarray | None, floor: float) -> str:
+    """Return a skeleton with its shadow as SVG elements, in a panel of PANEL pixels; see `draw_skeleton`."""
+    scale = PANEL[1] / camera.metres
+
+    def place(point: np.ndarray) -> tuple[float, float]:
+        right, up, _ = scale * camera.project(point)
+        return PANEL[0] / 2 + right, PANEL[1] / 2 - up
+
+    spread = float(np.linalg.norm(joints[:, :2] - joints[0, :2], axis=1).max())
+    x, y = place(np.array([*joints[0, :2], floor]))
+    flat = np.sin(camera.elevation)
+    shadow = f'<ellipse cx="{x:.1f}" cy="{y:.1f}" rx="{scale * spread:.1f}" ry="{scale * spread * flat:.1f}"'
+    parts = [shadow + ' fill="#000" opacity=".08"/>']
+    ends = {limb: np.stack(find_limb_ends(limb, joints)) for limb in LIMBS}
+    middle = np.linspace(0, 1, PIECES + 1)
+    for limb in sorted(LIMBS, key=lambda one: camera.project(ends[one].mean(0))[2]):
+        first, last = ends[limb]
+        for begin, end in pairwise(middle):
+            share = (begin + end) / 2
+            colour = NEUTRAL_HEX
+            if errors is not None:
+                value = (1 - share) * errors[limb.first_joint] + share * errors[limb.end]
+                colour = mix_heat(float(value))
+            (x1, y1), (x2, y2) = (place(first + part * (last - first)) for part in (begin, end))
+            radius = scale * (limb.radii[0] + share * (limb.radii[1] - limb.radii[0]))
+            line = f'<path d="M{x1:.1f} {y1:.1f}L{x2:.1f} {y2:.1f}" stroke="{colour}"'
+            parts.append(f'{line} stroke-width="{2 * radius:.1f}" stroke-linecap="round"/>')
+    return "".join(parts)
+
+
+def mix_heat(value: float) -> str:
+    """Return the colour of an error, a fraction of the colour scale's top, as #rrggbb."""
+    stops = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in HEAT], float)
+    at = float(np.clip(np.nan_to_num(value, nan=1.0), 0, 1)) * (len(HEAT) - 1)
+    low = min(int(at), len(HEAT) - 2)
+    return "#" + "".join(
+        f"{round(part):02x}" for part in stops[low] + (at - low) * (stops[low + 1] - stops[low])
+    )
+
+
+def write_colour_scale(x: float, y: float, top: float) -> str:
+    """Return a horizontal colour scale from 0 to `top` cm as SVG elements."""
+    cells = (
+        f'<rect x="{x + 4 * i}" y="{y}" width="4" height="10" fill="{mix_heat(i / 29)}"/>' for i in range(30)
+    )
+    return (
+        "".join(cells)
+        + write_text(x, y + 26, "0", 12)
+        + write_text(x + 120, y + 26, f"{top:g} cm", 12, anchor="end")
+    )
+
+
+def write_text(
+    x: float, y: float, text: str, size: int, weight: str = "normal", anchor: str = "start"
+) -> str:
+    """Return a text as an SVG element."""
+    style = f'font-size="{size}" font-weight="{weight}" text-anchor="{anchor}"'
+    return f'<text x="{x:.0f}" y="{y:.0f}" {style}>{escape(text)}</text>'

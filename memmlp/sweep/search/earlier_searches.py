@@ -8,7 +8,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import parse_overrides
-from memmlp.common.plain_yaml import parse_yaml
+from memmlp.common.schema import parse_config_yaml
 from memmlp.common.text_formats import format_csv, parse_csv
 from memmlp.runs import records
 from memmlp.runs.records import SearchRecord
@@ -61,7 +61,7 @@ class FinishedSearch:
         """The values of the best trial by key. Raises InputError if no trial is complete."""
         if not self.complete:
             raise InputError(f"{self.folder}: no trial is complete; expected a search with a best trial")
-        return {key: parse_yaml(text) for key in self.keys if (text := self.complete[0][key])}
+        return {key: parse_config_yaml(text) for key in self.keys if (text := self.complete[0][key])}
 
     def measure_compute(self, row: Mapping[str, str]) -> list[float]:
         """Return the recorded compute of a trial's runs, TFLOP."""

@@ -19,7 +19,7 @@ from optuna.trial import FrozenTrial, TrialState
 from memmlp.common.errors import import_optional
 from memmlp.common.files import atomic_write
 from memmlp.common.overrides import select_last_by_key
-from memmlp.common.plain_yaml import parse_yaml
+from memmlp.common.schema import parse_config_yaml
 from memmlp.common.text_formats import format_csv
 from memmlp.sweep.search.study import Study, compute_deviations, get_reason, get_values
 
@@ -100,7 +100,7 @@ def format_experiment(study: Study, trial: FrozenTrial, groups: Collection[str])
         node = tree
         for name in parents:
             node = node.setdefault(name, {})
-        node[leaf] = parse_yaml(override.value or "")
+        node[leaf] = parse_config_yaml(override.value or "")
     head = (
         f"# @package _global_\n# Trial {trial.number} of {len(study.trials)} of the search {search.name}: "
         f"{', '.join(o.text for o in search.objectives)} on validation "

@@ -1,6 +1,8 @@
 """The page in a browser: it draws, stops, goes back, and fits a phone."""
 
 import contextlib
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Browser
-from processes import PATIENCE, until
+from processes import PATIENCE, hearing_interrupts, started, until
 
 from memmlp.live.session.loop import Fitting, make_greeting, run_loop
 from memmlp.live.session.server import Hub, LiveServer
@@ -52,6 +54,14 @@ def stage(browser: Browser) -> np.ndarray:
         "(b => [b.x, b.y, b.width, b.height])(document.querySelector('#stage').getBoundingClientRect())"
     )
     return browser.picture()[round(y) : round(y + height), round(x) : round(x + width)].astype(int)
+
+
+def test_the_shipped_network_moves_without_arguments(browser: Browser, tmp_path: Path):
+    line = [sys.executable, "-m", "memmlp.cli.main", "live", "--no-browser", "--port", "0"]
+    with hearing_interrupts(), started(line, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        browser.open(process.stdout.readline().split()[0])
+        browser.wait(f"{SHOWN} > 20")
+    assert not list(tmp_path.iterdir())
 
 
 def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import find_packaged_folder
 from memmlp.config.build_request import build_motion
 from memmlp.config.compose import compose_config
-from memmlp.config.plugins import find_packaged_folder
 from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
 from memmlp.sweep.sweep_file import load_sweep

@@ -1,0 +1,225 @@
+"""Pack a finished run as a shipped network, or cut the shipped clip. A maintainer's script, not a command.
+
+    python models/pack.py network RUN NAME --root DATA --title TITLE --command COMMAND
+    python models/pack.py clip FILE.npz --start SECONDS --seconds SECONDS
+
+Weight matrices are rounded to float16, so that the wheel is small. Then the rounded network is exported and
+measured again: the card describes the shipped files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+
+from memmlp.common.files import file_digest, write_json
+from memmlp.config.open_run import OpenedRun, open_run
+from memmlp.deploy.onnx_stream import OnnxStream
+from memmlp.deploy.parity import stream_onnx
+from memmlp.evaluation.modes import average_clips
+from memmlp.evaluation.modes import measure_clip as measure_errors
+from memmlp.motion.body import FPS, load_rest_joints
+from memmlp.motion.clip import resample
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.motion_source import ShippedMotion
+from memmlp.report.tables.effects import estimate_mean_interval
+from memmlp.report.tables.measured_run import MeasuredRun, load_measured_run
+from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.identity import find_evaluation_versions, select_evaluation_settings
+from memmlp.runs.lookup import CARD, find_run, find_shipped_clip
+from memmlp.runs.run import Run
+from memmlp.training.run_stages import deploy_run, describe_machine
+
+MODELS = Path(__file__).parent
+DATA = "outputs/data/persons"  # the folder of the import in docs/guides/motion.md
+KEPT = (
+    "id", "kind", "name", "data", "body", "prerequisite", "started", "finished", "seconds", "steps", "tflop",
+    "best_step", "component_versions", "version", "git", "packages", "cpu", "device", "threads", "precision",
+)  # fmt: skip
+METRICS = ("MPJRE", "MPJPE", "MPJVE", "Jitter", "GT Jitter")
+TERMS = (
+    'The motion is from the CMU motion-capture database: "This data is free for use in research and '
+    'commercial projects worldwide." "The data used in this project was obtained from mocap.cs.cmu.edu. The '
+    'database was created with funding from NSF EIA-0196217." The weights have the license of the package, '
+    "Apache-2.0."
+)
+
+
+def round_weights(source: Path, target: Path) -> None:
+    """Write the tensors with matrices in float16; other tensors are unchanged."""
+    with source.open("rb") as file:
+        header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+    tensors = {
+        name: tensor.half()
+        if tensor.dtype == torch.float32 and tensor.ndim > 1 and tensor.numel() > 999
+        else tensor
+        for name, tensor in load_file(source).items()
+    }
+    save_file(tensors, target, header["__metadata__"])
+
+
+def copy_run(run: Run, name: str) -> Run:
+    """Copy a run's config, log and rounded weights, without evaluations and paths of this machine."""
+    shipped = Run(MODELS / name)
+    shutil.rmtree(shipped.folder, ignore_errors=True)
+    shipped.folder.mkdir()
+    config = run.config
+    config["paths"]["outputs"], config["data"]["root"], config["threads"] = "outputs", DATA, 1
+    config["evaluation"]["modes"], config["export"]["graph"] = ["stream"], "auto"
+    shipped.config_path.write_text(yaml.safe_dump(config, sort_keys=False))
+    manifest = {key: run.manifest[key] for key in KEPT if key in run.manifest}
+    write_json(shipped.manifest_path, {**manifest, "shipped": name})
+    shutil.copy(run.metrics_path, shipped.metrics_path)
+    round_weights(run.model, shipped.model)
+    artifacts = {shipped.model.name: file_digest(shipped.model)}
+    write_json(
+        shipped.marker,
+        {"id": run.manifest["id"], "finished": run.manifest["finished"], "artifacts": artifacts},
+    )
+    return shipped
+
+
+def measure(shipped: Run, root: Path, outputs: Path) -> OpenedRun:
+    """Export the shipped network, and measure the ONNX file on the test clips of its data."""
+    opened = open_run(outputs, str(shipped.folder), overrides=[f"data.root={root}"])
+    experiment, data = opened.experiment, opened.data
+    with shipped.lock():
+        shipped.request_stages(experiment.stage_ids)
+        deploy_run(experiment, shipped, data)  # type: ignore[arg-type]
+        evaluate_file(opened, shipped.preferred_onnx)
+    for path in shipped.folder.glob(".lease*"):
+        path.unlink()
+    kept = {key: value for key, value in shipped.manifest.items() if key in (*KEPT, "shipped", "stages")}
+    write_json(shipped.manifest_path, kept)
+    return opened
+
+
+def evaluate_file(opened: OpenedRun, file: Path) -> None:
+    """Write the run's evaluation in stream mode, from the ONNX file instead of torch, which takes minutes."""
+    experiment, run, test = opened.experiment, opened.run, opened.test
+    stream, normalizer, rows = OnnxStream(file), opened.network().normalizer, []
+    for index, clip in enumerate(test.read_clips()):
+        facts = {"name": test.names[index], "group": test.groups[index], "frames": len(clip)}
+        rows.append(facts | measure_errors(normalizer, stream_onnx(stream, clip), clip))
+    branches = [{key: row[key] for key in ("rotation", "position")} for row in rows]
+    name = experiment.evaluations["stream"]
+    settings = select_evaluation_settings(experiment.config, "stream", experiment.motion.groups_digest)
+    report = {"mode": "stream", "run": run.manifest["id"], "name": name, "settings": settings}
+    report |= {"component_versions": find_evaluation_versions(settings), **describe_machine(experiment)}
+    mean = average_clips(branches, [row["frames"] for row in rows])
+    write_report(run.evaluation(name), {**report, "mean": mean, "clips": rows})
+
+
+def measure_clip(opened: OpenedRun) -> dict[str, Any]:
+    """Return the errors on the shipped clip."""
+    path = find_shipped_clip()
+    test = ShippedMotion(path, load_rest_joints("builtin")).open("test")
+    clip = test.read_clip(0)
+    motion = stream_onnx(OnnxStream(opened.run.preferred_onnx), clip)
+    means = measure_errors(opened.network().normalizer, motion, clip)
+    errors = {
+        branch: {k: round(v, 4) for k, v in row.items() if k in METRICS} for branch, row in means.items()
+    }
+    return {"name": path.stem, "seconds": round(len(clip) / FPS, 2), "errors": errors}
+
+
+def summarize_errors(measured: MeasuredRun) -> dict[str, Any]:
+    """Return each branch's errors in stream mode: mean, and 95 % interval over persons."""
+    found: dict[str, Any] = {}
+    for branch, row in measured.means["stream"].items():
+        for metric in METRICS:
+            if np.isfinite(float(row.get(metric, np.nan))):
+                low, high = estimate_mean_interval([measured], "stream", branch, metric)
+                numbers = (float(row[metric]), low, high)
+                found.setdefault(branch, {})[metric] = [None if n is None else round(n, 3) for n in numbers]
+    return found
+
+
+def make_card(opened: OpenedRun, title: str, command: str) -> dict[str, Any]:
+    """Return the card of a shipped network."""
+    run, clips = opened.run, opened.data.manifest.clips  # type: ignore[union-attr]
+    measured, record = load_measured_run(run.folder), run.preferred_deployment.record
+    parts = {p: [c for c in clips if c.split == p] for p in ("train", "val", "test")}
+    files = [path for path in sorted(run.folder.rglob("*")) if path.suffix in (".onnx", ".safetensors")]
+    config, manifest = run.config, run.manifest
+    recipe = {key: config["optim"][key] for key in ("name", "steps", "batch", "lr", "warmup", "best_by")}
+    recipe |= {
+        "frames": config["model"]["frames"],
+        **{key: manifest.get(key) for key in ("best_step", "tflop")},
+    }
+    return {
+        "name": run.id,
+        "title": title,
+        "model": config["model"]["name"],
+        "command": command,
+        "commit": manifest["git"]["commit"],
+        "version": manifest["version"],
+        "recipe": recipe,
+        "parameters": record["parameters"],
+        "persons": {part: sorted({clip.group for clip in own}) for part, own in parts.items()},
+        "clips": {part: len(own) for part, own in parts.items()},
+        "minutes": {part: round(sum(c.length for c in own) / FPS / 60, 1) for part, own in parts.items()},
+        "errors": summarize_errors(measured),
+        "clip": measure_clip(opened),
+        "latency": {
+            key: round(record[key], 4)
+            for key in ("median_ms", "p95_ms", "pose_median_ms", "ratio_to_yardstick", "core_share")
+            if key in record
+        } | {"cpu": record["made_by"]["cpu"]},
+        "files": {path.name: {"bytes": path.stat().st_size, "sha256": file_digest(path)} for path in files},
+        "weights": "matrices rounded to float16",
+        "terms": TERMS,
+    }  # fmt: skip
+
+
+def pack_network(run_name: str, name: str, root: Path, outputs: Path, title: str, command: str) -> None:
+    """Pack a run; print its card."""
+    run = find_run(outputs, run_name)
+    opened = measure(copy_run(run, name), root, outputs)
+    card = make_card(opened, title, command)
+    (MODELS / name / CARD).write_text(json.dumps(card, indent=1) + "\n")
+    print(json.dumps(card, indent=1))
+
+
+def cut_clip(source: Path, start: float, seconds: float) -> None:
+    """Write a piece of an imported clip at 60 Hz to models/clip."""
+    clip, _ = resample(read_clip(source, source.stem))
+    piece = slice(round(start * FPS), round((start + seconds) * FPS))
+    arrays = {"poses": clip.poses[piece].reshape(-1, 66), "trans": clip.trans[piece]}
+    (MODELS / "clip").mkdir(exist_ok=True)
+    out = MODELS / "clip" / f"cmu_{source.stem}.npz"
+    np.savez_compressed(out, mocap_framerate=60.0, **{k: v.astype(np.float32) for k, v in arrays.items()})
+    print(out, out.stat().st_size)
+
+
+def main() -> None:
+    """Parse the arguments, and pack."""
+    parser = argparse.ArgumentParser()
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    network, clip = kinds.add_parser("network"), kinds.add_parser("clip")
+    network.add_argument("run")
+    network.add_argument("name")
+    network.add_argument("--root", type=Path, required=True)
+    network.add_argument("--outputs", type=Path, default=Path("outputs"))
+    network.add_argument("--title", required=True)
+    network.add_argument("--command", required=True, help="the command of the training")
+    clip.add_argument("source", type=Path)
+    clip.add_argument("--start", type=float, default=0.0)
+    clip.add_argument("--seconds", type=float, default=15.0)
+    given = parser.parse_args()
+    if given.kind == "clip":
+        cut_clip(given.source, given.start, given.seconds)
+    else:
+        pack_network(given.run, given.name, given.root.resolve(), given.outputs, given.title, given.command)
+
+
+if __name__ == "__main__":
+    main()
