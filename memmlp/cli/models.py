@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from memmlp.common.processes import MIN_CORE_FRACTION
 from memmlp.runs.lookup import find_shipped_clip, list_shipped, read_card
 
 
@@ -48,13 +49,13 @@ def list_networks(cards: list[dict[str, Any]]) -> None:
         "MPJPE\ncm",
         "MPJVE\ncm/s",
         "Jitter\n10^2 m/s^3",
-        "step\nms",
+        "parameters\nM",
     ):
         table.add_column(header, justify="left" if header in ("name", "network") else "right")
     for card in cards:
         errors = card["errors"]["rotation"]
         shown = (f"{errors[metric][0]:.2f}" for metric in ("MPJRE", "MPJPE", "MPJVE", "Jitter"))
-        table.add_row(card["name"], card["title"], *shown, f"{card['latency']['median_ms']:.2f}")
+        table.add_row(card["name"], card["title"], *shown, f"{card['parameters'] / 1e6:.2f}")
     make_console().print(table)
     persons, minutes = cards[0]["persons"]["test"], cards[0]["minutes"]["test"]
     click.echo(f"errors in stream mode on {len(persons)} persons of no training ({minutes:g} minutes)")
@@ -93,9 +94,12 @@ def format_card(card: Mapping[str, Any]) -> Iterator[str]:
         )
     )
     yield f"- Size: {card['parameters'] / 1e6:.2f} M parameters, {card['weights']}."
-    yield f"- Latency on one core ({latency['cpu']}): {latency['median_ms']:.2f} ms a step, median; " + (
-        f"{latency['ratio_to_yardstick']:.2f} times the yardstick."
-    )
+    if latency["core_share"] < MIN_CORE_FRACTION:
+        yield "- Latency: not measured on a quiet machine yet."
+    else:
+        yield f"- A step on one core ({latency['cpu']}): {latency['median_ms']:.2f} ms, median; " + (
+            f"{latency['ratio_to_yardstick']:.2f} times the yardstick."
+        )
     yield f"- Command: `{card['command']}` (commit `{card['commit'][:8]}`)."
     yield f"- Terms: {card['terms']}"
     yield ""
