@@ -42,20 +42,13 @@ def list_networks(cards: list[dict[str, Any]]) -> None:
     from memmlp.common.text_formats import make_console
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for header in (
-        "name",
-        "network",
-        "MPJRE\ndeg",
-        "MPJPE\ncm",
-        "MPJVE\ncm/s",
-        "Jitter\n10^2 m/s^3",
-        "parameters\nM",
-    ):
-        table.add_column(header, justify="left" if header in ("name", "network") else "right")
+    table.add_column("name", no_wrap=True)
+    for header in ("MPJRE\ndeg", "MPJPE\ncm", "MPJVE\ncm/s", "Jitter\n10² m/s³", "parameters\nM"):
+        table.add_column(header, justify="right")
     for card in cards:
         errors = card["errors"]["rotation"]
         shown = (f"{errors[metric][0]:.2f}" for metric in ("MPJRE", "MPJPE", "MPJVE", "Jitter"))
-        table.add_row(card["name"], card["title"], *shown, f"{card['parameters'] / 1e6:.2f}")
+        table.add_row(card["name"], *shown, f"{card['parameters'] / 1e6:.2f}")
     make_console().print(table)
     persons, minutes = cards[0]["persons"]["test"], cards[0]["minutes"]["test"]
     click.echo(f"errors in stream mode on {len(persons)} persons of no training ({minutes:g} minutes)")

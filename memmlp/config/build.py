@@ -45,7 +45,13 @@ from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, find_option, select_training_config
 from memmlp.runs.loggers.logger import Loggers
-from memmlp.runs.lookup import check_trained, describe_kind, find_outputs
+from memmlp.runs.lookup import (
+    check_trained,
+    describe_kind,
+    find_outputs,
+    find_shipped_clip,
+    get_shipped_name,
+)
 from memmlp.runs.run import Run
 from memmlp.training.devices import choose_device
 from memmlp.training.losses import Loss, MotionLoss, Term
@@ -252,6 +258,8 @@ def load_config(run: Run, overrides: Sequence[str] = (), outputs: Path | None = 
             f"{run.config_path}: this version of memmlp cannot read the config ({reason})"
         ) from None
     _use_outputs(cfg, outputs or find_outputs(run))
+    if get_shipped_name(run) and not Path(str(cfg.data.root)).exists():
+        cfg.data.root = escape_interpolations(str(find_shipped_clip().parent))
     for word in overrides:
         _apply_override(cfg, word)
     check(cfg)

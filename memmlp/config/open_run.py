@@ -64,7 +64,7 @@ def load_run_data(run: Run, experiment: Experiment) -> PreparedMotion | ShippedM
     For a shipped network without data.root=FOLDER, the data is the shipped clip.
     """
     root = experiment.config["data"]["root"]
-    if get_shipped_name(run) and root == run.config["data"]["root"] and not Path(root).exists():
+    if get_shipped_name(run) and Path(root) == find_shipped_clip().parent:
         return ShippedMotion(find_shipped_clip(), load_rest_joints(str(experiment.motion.clips.body)))
     # Clips of the list may be missing, as long as the digest matches the training data.
     data = replace(experiment.motion, partial=True).prepare()

@@ -26,11 +26,11 @@ ARCHIVE = Path(__file__).parents[3] / "shared" / "data" / "cmu-asfamc" / "cmu-as
 
 
 def test_names_are_found_and_unknown_ones_refused(tmp_path: Path):
-    assert NAMES == ["mem_mlp", "recurrent_poser"]
+    assert {"recurrent_poser"} <= set(NAMES)
     for name in NAMES:
         assert find_run(tmp_path, name).done
     with pytest.raises(InputError, match="recurrent_poser"):
-        find_run(tmp_path, "mem_mlp_2")
+        find_run(tmp_path, "recurrent_poser_2")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -116,8 +116,8 @@ def test_eval_shows_the_card_and_measures_only_with_data(memmlp, tmp_path: Path)
 
 
 def test_the_list_and_the_cards(memmlp):
-    listed, card = memmlp("models"), memmlp("models", "mem_mlp")
+    listed, card = memmlp("models"), memmlp("models", NAMES[0])
     assert all(name in listed.out for name in NAMES)
-    assert read_card("mem_mlp")["commit"][:8] in card.out
+    assert read_card(NAMES[0])["commit"][:8] in card.out
     assert memmlp("models", "--markdown").out.count("\n## ") + 1 == len(NAMES)
     assert memmlp("models", "none").code == 2
