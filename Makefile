@@ -52,7 +52,7 @@ check: $(STAMP)
 	$(BIN)/lint-imports
 
 docs: .venv/.docs
-	$(BIN)/python -m sphinx --write-all --fresh-env --fail-on-warning --keep-going --quiet docs site
+	$(BIN)/python -m sphinx --jobs auto --write-all --fresh-env --fail-on-warning --keep-going --quiet docs site
 	@echo "open site/index.html"
 
 dist: .venv/.publish

@@ -22,7 +22,7 @@ author = "The memmlp developers"
 copyright = f"2026, {author}"
 version = release = memmlp.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode",
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.linkcode",
               "sphinx_copybutton", "sphinx_design"]  # fmt: skip
 exclude_patterns = ["results/templates", "examples"]
 myst_enable_extensions = ["colon_fence"]
@@ -44,10 +44,7 @@ autodoc_preserve_defaults = True
 autodoc_type_aliases = {name: name for name in ("ArrayLike", "RunLogger", "State", "Terms")}
 napoleon_use_ivar = True
 napoleon_custom_sections = ["Source"]
-suppress_warnings = [
-    "myst.header",  # pages of results begin with the heading that they have as a part of another
-    "ref.python",  # attributes' names are no references
-]
+suppress_warnings = ["ref.python"]  # attributes' names are no references
 
 
 COLON = "\N{TWO DOT PUNCTUATION}"  # a colon that napoleon does not see
@@ -100,6 +97,13 @@ def named_fields(
 ) -> bool | None:
     """Leave out the fields of named tuples, which their class describes."""
     return True if type(thing).__name__ == "_tuplegetter" else None
+
+
+def linkcode_resolve(domain: str, info: dict[str, str]) -> str | None:
+    """Return the address of a module's source code. Pages with copies of all modules take long to build."""
+    path = HERE.parent / info["module"].replace(".", "/")
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    return f"https://github.com/memmlp/memmlp/blob/main/{file.relative_to(HERE.parent)}"
 
 
 def setup(app: Sphinx) -> None:

@@ -17,7 +17,7 @@ from memmlp.report.pictures.frontier import draw_frontiers, has_frontier
 from memmlp.report.tables.flags import join_first
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table import Cell, Effect, Row, Table
+from memmlp.report.tables.table import Cell, Row, Table
 from memmlp.report.tables.table_text import (
     CONFOUNDED,
     MISSING,
@@ -28,7 +28,6 @@ from memmlp.report.tables.table_text import (
     format_effect,
     format_mean,
     format_paper,
-    format_value,
     list_remarks,
     make_caption,
     make_heading,
@@ -105,10 +104,9 @@ def _make_page(name: str, source: KeptTable) -> str:
     if has_frontier(table):
         parts.append(f"![Error against compute and latency, with 95 % intervals]({name}_frontier.svg)")
     parts.append(_make_series_table(table) if _has_cells(table) else _make_short_table(table))
-    if remarks := [
-        textwrap.shorten(one, MAX_REMARK, placeholder=" …") for one in _list_number_remarks(table)
-    ]:
-        parts.append("\n".join(f"- {escape_markdown(one)}" for one in remarks))
+    if remarks := _list_number_remarks(table):
+        short = (textwrap.shorten(one, MAX_REMARK, placeholder=" …") for one in remarks)
+        parts.append("\n".join(f"- {escape_markdown(one)}" for one in short))
     parts.append(
         f"[All numbers]({FILES}/{name}.csv): every mode, branch and source of test clips, with intervals. "
         f"[Remarks]({FILES}/remarks.json): commits, machines, settings."
@@ -144,32 +142,9 @@ def _count_by_branch(table: Table) -> Iterator[str]:
     signed = any(cell.paper_effect for *_, cell, _ in table.list_effects(mode))
     what = "effects with a sign in the paper" if signed else "differences"
     for branch in BRANCHES:
-        if counts := Counter(_list_verdicts(table, mode, branch, signed)):
+        if counts := table.count_verdicts(mode, branch=branch, signed=signed):
             head = f"In the {branch} branch" if branch else f"Of {counts.total()} {what}"
             yield f"{head}: {format_counts(counts)}."
-
-
-def _list_verdicts(
-    table: Table, mode: str, branch: str, signed: bool, confounded: bool = False
-) -> list[Verdict]:
-    """Return the verdicts in a branch, "" for each row's branch, of confounded or of other rows.
-
-    With `signed`, only effects with a sign in the paper count.
-    """
-    return [
-        effect.verdict
-        for row in table.rows
-        if bool(row.confounded) == confounded
-        for metric, cell in row.cells[mode].items()
-        if (effect := _find_effect(row, mode, branch, metric)) and effect.verdict
-        if cell.paper_effect or not signed
-    ]
-
-
-def _find_effect(row: Row, mode: str, branch: str, metric: str) -> Effect | None:
-    if branch in ("", row.branch):
-        return row.cells[mode][metric].effect
-    return row.branches.get(branch, {}).get(mode, {}).get(metric)
 
 
 def _has_several_controls(table: Table) -> bool:
@@ -187,8 +162,8 @@ def _make_short_table(table: Table) -> str:
     lines = []
     for row in (row for row in table.rows if row.found or row.is_paper_only):
         cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
-        label = f"{row.label} {CONFOUNDED}" if row.confounded else row.label
-        head = [label, row.against or ""] if several else [label]
+        label = escape_markdown(f"{row.label} {CONFOUNDED}" if row.confounded else row.label)
+        head = [label, escape_markdown(row.against or "")] if several else [label]
         if row.found:
             seeds = f"{len(row.found)}/{len(row.wanted)}"
             lines.append([*head, seeds, *(_describe_cell(cell, metric) for cell, metric in cells)])
@@ -223,8 +198,10 @@ def _make_series_table(table: Table) -> str:
         cells = [
             _describe_point(rows[one].cells[mode][metric], metric) if one in rows else "" for one in series
         ]
-        lines.append([re.sub(r"[\w.]+\.(\w+=)", r"\1", point), ", ".join(sorted(seeds)), *cells])
-    return f"{make_heading(metric)}:\n\n{_make_markdown_table(['point', 'seeds', *series], lines)}"
+        short_point = escape_markdown(re.sub(r"[\w.]+\.(\w+=)", r"\1", point))
+        lines.append([short_point, ", ".join(sorted(seeds)), *cells])
+    heads = ["point", "seeds", *map(escape_markdown, series)]
+    return f"{make_heading(metric)}:\n\n{_make_markdown_table(heads, lines)}"
 
 
 def _describe_point(cell: Cell, metric: str) -> str:
@@ -233,11 +210,7 @@ def _describe_point(cell: Cell, metric: str) -> str:
 
 
 def _make_markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; all cells except links are escaped."""
-    cells = [[cell if cell.endswith(")") and cell.startswith("[") else escape_markdown(cell) for cell in row]
-             for row in rows]  # fmt: skip
-    lines = [list(map(escape_markdown, heads)), ["---"] * len(heads), *cells]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in (heads, ["---"] * len(heads), *rows))
 
 
 def _list_number_remarks(table: Table) -> list[str]:
@@ -302,22 +275,6 @@ class Placeholders:
         methods = {name: getattr(self, name) for name in dir(self) if not name.startswith("_")}
         return {**methods, "names": sorted(self.sources)}
 
-    def has(self, name: str) -> bool:
-        """Return whether there are results with that name."""
-        return name in self.sources
-
-    def effect(self, name: str, variant: str, mode: str, metric: str) -> str:
-        """Return a measured difference with its interval and verdict: `+1.17 [0.40, 2.23], holds`."""
-        cell = self._find_cell(name, variant, mode, metric)
-        verdict = (
-            "not measured" if cell.effect is None or cell.effect.verdict is None else cell.effect.verdict
-        )
-        return f"{' '.join(word.replace('*', '') for word in format_effect(cell, metric)[:2])}, {verdict}"
-
-    def value(self, name: str, variant: str, mode: str, metric: str) -> str:
-        """Return a variant's mean and standard deviation over seeds."""
-        return format_value(self._find_cell(name, variant, mode, metric), metric)
-
     def claims(self, names: Sequence[str], mode: str = "stream") -> str:
         """Return a table with the verdicts on the paper's effects: a line for each table, a column a branch.
 
@@ -375,24 +332,21 @@ class Placeholders:
         rows = [row for row in self._find_table(name).rows if row.found and cost in row.costs]
         best, texts = float("inf"), []
         for row in sorted(rows, key=lambda row: row.costs[cost]):
-            mean = self._find_cell(name, row.label, mode, metric).mean
-            if mean is not None and mean < best:
-                best = mean
-                number = format_mean(row.cells[mode][metric], metric)
-                texts.append(f"{row.label} {number} {find_unit(metric)} ({cost} {row.costs[cost]:.2g})")
+            cell = row.cells[mode][metric]
+            if cell.mean is not None and cell.mean < best:
+                best = cell.mean
+                number = f"{format_mean(cell, metric)} {find_unit(metric)}"
+                texts.append(f"{row.label} {number} ({cost} {row.costs[cost]:.2g})")
         return escape_markdown(join_first(texts))
 
     def _count_claims(self, tables: Iterable[Table], mode: str, branch: str) -> str:
-        counts = [Counter[Verdict](), Counter[Verdict]()]
+        counts: dict[str, Counter[Verdict]] = {"": Counter(), f"{CONFOUNDED} ": Counter()}
         for table in tables:
-            for apart, found in enumerate(counts):
-                found.update(_list_verdicts(table, mode, branch, True, bool(apart)))
-        texts = [
-            f"{mark}{format_counts(found)}"
-            for mark, found in zip(("", f"{CONFOUNDED} "), counts, strict=True)
-            if found
-        ]
-        return "; ".join(texts) or MISSING
+            for mark, found in counts.items():
+                found.update(table.count_verdicts(mode, bool(mark), branch))
+        return (
+            "; ".join(f"{mark}{format_counts(found)}" for mark, found in counts.items() if found) or MISSING
+        )
 
     def _count_significant(self, table: Table) -> str:
         counts = [Counter[bool](), Counter[bool]()]
@@ -402,17 +356,7 @@ class Placeholders:
         return f"{sound}; {CONFOUNDED} {apart}" if counts[1] else sound
 
     def _find_table(self, name: str) -> Table:
-        _check_name("results", name, self.sources)
+        if name not in self.sources:
+            choices = ", ".join(sorted(self.sources)) or "none"
+            raise InputError(f"'{name}': results must be one of {choices}")
         return self.sources[name].table
-
-    def _find_cell(self, name: str, variant: str, mode: str, metric: str) -> Cell:
-        rows = {row.label: row for row in self._find_table(name).rows}
-        _check_name(f"variant of {name}", variant, rows)
-        _check_name("mode", mode, rows[variant].cells)
-        _check_name(f"metric of {name}", metric, rows[variant].cells[mode])
-        return rows[variant].cells[mode][metric]
-
-
-def _check_name(kind: str, name: str, choices: Iterable[str]) -> None:
-    if name not in choices:
-        raise InputError(f"'{name}': {kind} must be one of {', '.join(choices) or 'none'}")

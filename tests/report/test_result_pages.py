@@ -32,19 +32,13 @@ def fill(template: str, table: KeptTable) -> str:
     return make_pages({"t": table}, {"README.md": f"{template}\n"})["README.md"]
 
 
-def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept: KeptResults):
+def test_a_template_names_what_holds(sweep: Sweep, kept: KeptResults):
     made = source(sweep, kept)
-    template = (
-        'MPJPE {{ effect("t", "2", "stream", "MPJPE") }}; {{ value("t", "2", "stream", "MPJPE") }}. '
-        '{% if has("u") %}never{% endif %}{{ decisions(["t"], "holds") }}'
-    )
-    text = fill(template, made)
+    text = fill('{{ decisions(["t"], "holds") }} {% if "u" in names %}never{% endif %}', made)
     row = next(row for row in made.table.rows if row.label == "2")
-    effect = row.cells["stream"]["MPJPE"].effect
-    assert effect.verdict == Verdict.HOLDS
-    assert f"MPJPE +{effect.mean:.2f} [{effect.low:.2f}, {effect.high:.2f}], holds" in text
-    assert f"{row.cells['stream']['MPJPE'].mean:.2f} ± " in text
-    assert re.search(r"'2': \w.*MPJPE", text)
+    holds = [m for m, cell in row.cells["stream"].items() if cell.effect.verdict == Verdict.HOLDS]
+    assert "MPJPE" in holds
+    assert f"Table 14 '2': {', '.join(holds)}" in text
     assert "never" not in text
 
 
@@ -128,11 +122,7 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
 
 
 @pytest.mark.parametrize(("template", "words"), [
-    ('{{ effect("u", "2", "stream", "MPJPE") }}', "'u'"),
-    ('{{ effect("t", "3", "stream", "MPJPE") }}', "'3'"),
-    ('{{ effect("t", "2", "live", "MPJPE") }}', "'live'"),
-    ('{{ effect("t", "2", "stream", "MPJ") }}', "'MPJ'"), ('{{ claims(["u"]) }}', "'u'"),
-    ("{{ nothing }}", "'nothing' is undefined"), ("{{ effect(", "README.md"),
+    ('{{ claims(["u"]) }}', "'u'"), ("{{ nothing }}", "'nothing' is undefined"), ("{{ claims(", "README.md"),
 ])  # fmt: skip
 def test_bad_templates_are_one_line(sweep: Sweep, kept: KeptResults, template: str, words: str):
     with pytest.raises(InputError, match=re.escape(words)) as raised:

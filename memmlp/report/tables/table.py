@@ -202,14 +202,25 @@ class Table:
                 if cell.effect is not None and cell.effect.verdict is not None:
                     yield row, metric, cell, cell.effect
 
-    def count_verdicts(self, mode: str, confounded: bool = False) -> Counter[Verdict]:
-        """Count the verdicts on effects that the paper prints, in a mode, of confounded or of other rows."""
-        found = [
-            effect.verdict
-            for row, _, cell, effect in self.list_effects(mode)
-            if cell.paper_effect and bool(row.confounded) == confounded
-        ]
-        return Counter(verdict for verdict in found if verdict is not None)
+    def count_verdicts(
+        self, mode: str, confounded: bool = False, branch: str = "", signed: bool = True
+    ) -> Counter[Verdict]:
+        """Count the verdicts in a mode, of confounded or of other rows.
+
+        Args:
+            mode: the mode of evaluation.
+            confounded: whether to count confounded rows, instead of all other rows.
+            branch: the branch of variant and control; by default, each row's branch.
+            signed: whether to count only effects that the paper prints.
+        """
+        counts = Counter[Verdict]()
+        for row in (row for row in self.rows if bool(row.confounded) == confounded):
+            others = row.branches.get(branch, {}).get(mode, {})
+            for metric, cell in row.cells[mode].items():
+                effect = cell.effect if branch in ("", row.branch) else others.get(metric)
+                if effect and effect.verdict and (cell.paper_effect or not signed):
+                    counts[effect.verdict] += 1
+        return counts
 
     def find_detectable(self, mode: str, metric: str) -> float | None:
         """Return the smallest difference that every comparison detects with 80 % power; None if unknown.

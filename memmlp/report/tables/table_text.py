@@ -100,7 +100,9 @@ def make_legend(table: Table) -> list[str]:
     if not any(row.found for row in table.rows):
         return lines
     if table.measured_metrics:
-        lines.append(f"mean ± sd over seeds of the means over test clips{_explain_intervals(table)}")
+        groups = max(row.groups for row in table.rows)
+        interval = "" if table.number else f" [95 % interval over seeds and at most {groups} groups of clips]"
+        lines.append(f"mean ± sd over seeds of the means over test clips{interval}")
     if any(True for mode in table.modes for _ in table.list_effects(mode)):
         lines += [_explain_differences(table), _explain_verdicts(table)]
         if table.analyses:
@@ -154,14 +156,6 @@ def _explain_verdicts(table: Table) -> str:
         "higher or lower (significant, where the paper prints no difference), equivalent (nearer to 0 than "
         f"the smallest effect of interest: {', '.join(margins)}), inconclusive (none of these)"
     )
-
-
-def _explain_intervals(table: Table) -> str:
-    groups = sorted({row.groups for row in table.rows if row.groups})
-    if table.number or not groups:
-        return ""
-    number = f"{groups[0]}" if len(groups) == 1 else f"{groups[0]} to {groups[-1]}"
-    return f" [95 % interval over seeds and {number} groups of clips; with data=persons, groups are persons]"
 
 
 def _explain_branches(table: Table) -> list[str]:
