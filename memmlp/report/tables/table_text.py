@@ -290,8 +290,9 @@ def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
     star = "*" if effect.is_significant else ""
     at = f" ({effect.decided})" if effect.decided else ""
     verdict = () if effect.verdict is None else (f"{effect.verdict}{at}",)
-    known = effect.holm is not None and 0 < effect.groups <= FEW_GROUPS
-    p = (f"p {format_significant(effect.holm, 2)}",) if known else ()
+    p: tuple[str, ...] = ()
+    if effect.holm is not None and 0 < effect.groups <= FEW_GROUPS:
+        p = (f"p {format_significant(effect.holm, 2)}",)
     return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict, *p
 
 
