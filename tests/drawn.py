@@ -15,7 +15,6 @@ SHARES = {  # of seeds, clips' groups, clips, exponential clips and noise in the
     "skewed, little noise": (0, 0, 0, 20, 1),
     "seeds, skewed": (1, 0, 0, 1, 0),
 }
-GRID = [(3, 4, 1), (3, 40, 1), (5, 10, 2), (10, 4, 1), (5, 40, 10)]
 
 
 def differences(seeds: int, clips: int, size: int, shares: tuple[float, ...], tables: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory, NoMemory
-from memmlp.networks.motion_model import MotionModel, WindowlessModel
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, CodeMemorySettings, JointCodeMemory
 from memmlp.networks.predictor import TwoBranchSettings
 from memmlp.networks.recurrent_poser import RecurrentPoser, RecurrentPoserSettings
@@ -135,8 +135,6 @@ def tiny_sizes(name: str) -> dict[str, Any]:
 
 for new in set(list_component_names("model")) - {*BASELINES, "mem_mlp", "recurrent_poser", "constant_pose"}:
     BASELINES[new] = tiny_sizes(new)
-WINDOWLESS = [name for name in BASELINES if issubclass(find_component("model", name).kind, WindowlessModel)]
-"""Baselines without a window, which are streams in both modes of evaluation."""
 
 
 def build_baseline(name: str, normalizer: Normalizer, **changes) -> MotionModel:

@@ -94,16 +94,6 @@ def test_help_and_refusals_of_an_unknown_run_import_nothing_slow(tmp_path: Path)
     assert all(f"  {name} " in ran.stdout for name in COMMANDS)
 
 
-def test_help_of_train_lists_what_can_be_chosen_and_nothing_else(memmlp: Memmlp):
-    said = memmlp("train", "--help", "memory=none", "device=cpu").out
-    groups = said.partition("== Config ==")[0]
-    assert "\nmemory: gru, lstm, " in groups
-    assert "\nprofile: paper, small, tiny\n" in groups
-    for inner in ("schema", "hydra", "search"):
-        assert f"\n{inner}" not in groups
-    assert "\ndevice: cpu\n" in said
-
-
 @pytest.mark.parametrize(("arguments", "words"), [
     (["trian"], ["trian", "did you mean train?", "demo, train, data"]),
     (["--nope"], ["--nope", "memmlp --help"]),

@@ -54,11 +54,6 @@ def test_list_names_the_older_ones_and_counts_finished_vqvaes(memmlp: Memmlp, ou
     assert runs[3].id in memmlp("runs", "list", "--where", "kind=vqvae").out
 
 
-def test_an_empty_list_says_where_it_looked(memmlp: Memmlp):
-    said = f"no runs in {Path.cwd() / 'elsewhere' / 'runs'}: "
-    assert memmlp("runs", "list", "--outputs", "elsewhere").out.startswith(said)
-
-
 def test_show(memmlp: Memmlp, outputs: Path):
     ran = memmlp("runs", "show", "a", "--config")
     assert ran.code == 0
@@ -147,21 +142,6 @@ def test_results_by_an_earlier_recipe_are_told(memmlp, outputs: Path, monkeypatc
     assert f"window results {said}" in " ".join(memmlp("runs", "show", A).out.split())
     assert "earlier version" not in memmlp("runs", "show", B).out
     assert f"window results {said} -" in " ".join(memmlp("runs", "diff", A, B).out.split())
-
-
-def test_list_shows_what_differs_as_far_as_there_is_room(memmlp, outputs: Path, monkeypatch):
-    config = {"seed": 1, "memory": {"layers": [2]}}
-    Run.from_id(outputs, "d" * 16).begin("memmlp", config, data="d" * 64, prerequisite=None)
-    heads, more = (
-        {"run", "status", "name", "MPJPE", "stream"},
-        {"memory.layers", "window", "Jitter", "age", "ms"},
-    )
-    for width, expected in (("40", heads), ("85", heads | {"seed"}), ("140", heads | more | {"seed"})):
-        monkeypatch.setenv("COLUMNS", width)
-        said = memmlp("runs", "list").out
-        assert set(said.partition("─")[0].split()) == expected
-        hidden = "differ in seed, memory.layers: --columns name,seed,memory.layers,stream.MPJPE" in said
-        assert hidden == (width == "40")
 
 
 def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):

@@ -52,7 +52,10 @@ def test_train_gives_the_job_its_config(memmlp: Memmlp, jobs: list[DictConfig], 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arguments", [["seed=0,1", "-m"], ["hydra.mode=MULTIRUN", "seed=0,1"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["seed=0,1", "-m"], pytest.param(["hydra.mode=MULTIRUN", "seed=0,1"], marks=pytest.mark.long)],
+)
 def test_a_multirun(memmlp: Memmlp, jobs: list[DictConfig], tmp_path: Path, arguments: list[str]):
     assert (memmlp("train", *arguments).code, [cfg.seed for cfg in jobs]) == (0, [0, 1])
     assert {path.name for path in tmp_path.rglob("*")} <= {"outputs", "multirun", "multirun.yaml"}

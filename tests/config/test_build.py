@@ -190,12 +190,6 @@ def test_what_differs(words: str, expected: str):
     assert name(*words.split()) == expected
 
 
-def test_many_differences_are_counted():
-    words = [f"optim.{key}" for key in ("lr=0.02", "steps=9", "batch=3", "weight_decay=0.5", "clip_norm=2")]
-    found = name(*words, "memory=none", "predictor=rotation_only", "hand=off")
-    assert found.endswith(" · 2 more · seed 0")
-
-
 def test_a_vqvae_and_a_component_of_ones_own():
     whole = config()
     codes = {"normalizer": whole["normalizer"], "vqvae": whole["vqvae"] | {"codes": 9, "seed": 4}}

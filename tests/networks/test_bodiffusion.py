@@ -16,7 +16,6 @@ from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 
 CLIP = tiny.clip(25)
 TRUTH = tiny.clip(7)[None].expand(64, -1, -1)
-FINER = {"diffusion_steps": 60, "sampling_steps": 52, "depth": 1}
 
 
 def test_the_denoiser_learns_from_the_noised_truth_of_the_window():

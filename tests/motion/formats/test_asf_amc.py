@@ -251,15 +251,6 @@ def test_damaged_takes_are_one_line(tmp_path: Path, old: str, new: str, said: st
         read_amc(take)
 
 
-def test_a_take_may_end_anywhere(tmp_path: Path):
-    take = write_take(tmp_path / "05", movement(2))
-    whole = take.read_bytes()
-    for size in range(0, len(whole) - 8, 97):
-        take.write_bytes(whole[:size])
-        with pytest.raises(InputError, match=f"^{re.escape(str(take))}: .*expected"):
-            read_amc(take)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "takes", "cuts"), [("cmu-asfamc", 142, CUTS), ("hdm05-asfamc", 233, {})])
 def test_the_databases_have_the_takes_and_cuts_of_their_readmes(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 from bvh_samples import own_tree, performed, person, random_turns, refuse, tree, write
-from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, make_builtin_rest_joints
@@ -197,20 +196,6 @@ def test_several_up_axes_and_stances_of_one_skeleton_are_noted(tmp_path: Path) -
         "cmu_daz: the zero pose of 3",
     ):
         assert [note for note in notes if note.startswith(start)]
-
-
-def test_who_lies_is_imported_lying_where_up_is_told(tmp_path: Path) -> None:
-    poses, trans = WALK.poses.astype(float), np.tile([0.0, 0.0, -0.8], (len(WALK), 1))
-    poses[:, 0] = (Rotation.from_euler("x", 90, degrees=True) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
-    chosen, path = load_skeleton("smpl_words"), tmp_path / "clip.bvh"
-    write(tmp_path, performed(chosen, replace(WALK, poses=poses, trans=trans)).text())
-    with refuse(path, "stands along y in the zero pose, but along z in the motion"):
-        import_folder(path, tmp_path / "out")
-    import_folder(path, tmp_path / "out", ImportSettings(up="y"))
-    places = compute_clip_kinematics(read_clip(tmp_path / "out" / "clip.npz", "clip"), REST)[1]
-    assert np.abs(places[:, 15, 2] - places[:, 0, 2]).max() < 0.2  # the head is as high as the pelvis
-    (fidelity,) = verify_folder(path, ImportSettings(up="y"))
-    assert fidelity.mm.value < 1
 
 
 def test_clips_with_faults_are_left_out_where_only_sound_ones_are_wanted(tmp_path: Path) -> None:

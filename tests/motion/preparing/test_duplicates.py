@@ -110,12 +110,6 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "clips"
 
 
-def at_120_hz(root: Path) -> Path:
-    for activity in ACTIVITIES:
-        write_clip(root / "a" / f"{activity}.npz", recorded(activity, fps=120.0))
-    return root
-
-
 def write_all(root: Path, change: Callable[[Clip], Clip]) -> dict[str, str]:
     """Write a changed copy of each activity, and return the duplicates that should be found."""
     for activity in ACTIVITIES:
@@ -135,14 +129,6 @@ def test_a_copy_at_another_rate_is_found(
     found = survey_folder(root)
     assert found.duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
     assert len(found.clips) == 2 * len(ACTIVITIES)
-
-
-def test_copies_of_copies_are_one(root: Path):
-    for fps in (24.0, 90.0):
-        write_clip(root / "b" / f"{fps:g}.npz", resample(recorded("walking", fps=120.0), fps)[0])
-    for name in ("a/walking", "c"):
-        write_clip(root / f"{name}.npz", recorded("walking", fps=120.0))
-    assert survey_folder(root).duplicates == dict.fromkeys(("b/24", "b/90", "c"), "a/walking")
 
 
 def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypatch: pytest.MonkeyPatch):
