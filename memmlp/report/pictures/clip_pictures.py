@@ -213,7 +213,7 @@ def encode_svg(piece: ClipPiece, poses: int = POSES) -> str:
     parts = [write_text(12, 30, piece.title, 18, "bold")]
     for row, label in enumerate(labels):
         y = 56 + PANEL[1] * row
-        parts.append(write_text(12, y + 40, label, 15, "bold"))
+        parts.append(write_text(12, y + 16, label, 15, "bold"))
         for column, frame in enumerate(frames):
             camera = piece.make_camera(piece.find_azimuth(frame), piece.truth[frame, 0, :2])
             joints, errors = piece.list_skeletons(frame)[row]
