@@ -26,7 +26,7 @@ ARCHIVE = Path(__file__).parents[3] / "shared" / "data" / "cmu-asfamc" / "cmu-as
 
 
 def test_names_are_found_and_unknown_ones_refused(tmp_path: Path):
-    assert {"recurrent_poser"} <= set(NAMES)
+    assert NAMES == ["mem_mlp", "recurrent_poser"]
     for name in NAMES:
         assert find_run(tmp_path, name).done
     with pytest.raises(InputError, match="recurrent_poser"):
