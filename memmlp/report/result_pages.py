@@ -328,7 +328,7 @@ class Placeholders:
         return _make_markdown_table(heads, lines)
 
     def leaders(self, name: str, metric: str, cost: str, mode: str = "stream") -> str:
-        """Return the variants that no other one beats in both a metric and a cost, by cost."""
+        """Return the variants that no other one beats in both a metric and a cost, with both numbers."""
         rows = [row for row in self._find_table(name).rows if row.found and cost in row.costs]
         best, texts = float("inf"), []
         for row in sorted(rows, key=lambda row: row.costs[cost]):
@@ -336,7 +336,7 @@ class Placeholders:
             if cell.mean is not None and cell.mean < best:
                 best = cell.mean
                 number = f"{format_mean(cell, metric)} {find_unit(metric)}"
-                texts.append(f"{row.label} {number} ({cost} {row.costs[cost]:.2g})")
+                texts.append(f"{row.label} {number} ({row.costs[cost]:.2g})")
         return escape_markdown(join_first(texts))
 
     def _count_claims(self, tables: Iterable[Table], mode: str, branch: str) -> str:
