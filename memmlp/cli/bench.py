@@ -32,16 +32,11 @@ def bench() -> None:
 
 
 @bench.command("latency")
-@click.option(
-    "--rounds", default=5, show_default=True, type=click.IntRange(5), help="Number of timed rounds."
-)
-@click.option(
-    "--steps", default=20, show_default=True, type=click.IntRange(2), help="Number of steps per round."
-)
+@click.option("--rounds", default=5, type=click.IntRange(5), help="Number of timed rounds.")
+@click.option("--steps", default=20, type=click.IntRange(2), help="Number of steps per round.")
 @click.option(
     "--models",
     default=DEFAULT_MODELS,
-    show_default=True,
     help="Options of `model` to time, separated by commas; NAME@FRAMES sets model.frames.",
 )
 @click.option("--json", "file", type=PATH, help="JSON file to write the rows into.")
@@ -176,12 +171,8 @@ def shorten_number(number: float) -> str:
 
 
 @bench.command("train")
-@click.option(
-    "--rounds", default=5, show_default=True, type=click.IntRange(1), help="Number of timed rounds."
-)
-@click.option(
-    "--steps", default=10, show_default=True, type=click.IntRange(1), help="Number of steps per round."
-)
+@click.option("--rounds", default=5, type=click.IntRange(1), help="Number of timed rounds.")
+@click.option("--steps", default=10, type=click.IntRange(1), help="Number of steps per round.")
 @click.option("--profile", "kernels", is_flag=True, help="Also print the slowest functions of torch.")
 @click.argument("overrides", nargs=-1)
 @config_dir_option

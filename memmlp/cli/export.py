@@ -36,7 +36,6 @@ class ExportForm(NamedTuple):
 @click.option(
     "--graph",
     default="auto",
-    show_default=True,
     type=click.Choice(["auto", "streaming", "naive"]),
     help="Graph to export. streaming: computes each frame's features once and keeps them as state; naive: "
     "the network as trained; auto: streaming if available, otherwise naive.",
@@ -44,7 +43,6 @@ class ExportForm(NamedTuple):
 @click.option(
     "--precision",
     default="fp32",
-    show_default=True,
     type=click.Choice(["fp32", "fp16", "int8", "int8_blocks"]),
     help="Precision of the inner layers' weights. The accuracy of lower precisions is measured on test "
     "clips. int8 is calibrated on training clips.",
@@ -57,14 +55,12 @@ class ExportForm(NamedTuple):
 @click.option(
     "--opset",
     default=18,
-    show_default=True,
     type=click.IntRange(15, 26),
     help="ONNX operator set of the file; Unity's inference engine supports up to 15.",
 )
 @click.option(
     "--scope",
     default="step",
-    show_default=True,
     type=click.Choice(["step", "full"]),
     help="Computation in the file. step: the network's step, from its 54 inputs; full: all computations from "
     "tracker poses to joints.",

@@ -97,14 +97,12 @@ class LiveOptions(NamedTuple):
 @click.option(
     "--space",
     default=SPACE,
-    show_default=True,
     type=click.Choice(["amass", "openxr", "unity"]),
     help="Frame of reference of the packets' poses.",
 )
 @click.option(
     "--hz",
     default=HZ,
-    show_default=True,
     type=FiniteFloat(10, 1000),
     help="Sampling rate of a clip, Hz.",
 )

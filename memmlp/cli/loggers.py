@@ -38,7 +38,7 @@ def loggers() -> None:
     default=None,
     help="Address of MLflow's store.  [default: MLFLOW_TRACKING_URI if set, or SQLite in --outputs]",
 )
-@click.option("--project", default="memmlp", show_default=True, help="W&B project.")
+@click.option("--project", default="memmlp", help="W&B project.")
 @click.option("--full", is_flag=True, help="Also update runs that are up to date.")
 @outputs_option
 def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outputs: Path) -> None:
@@ -78,7 +78,7 @@ def _make_loggers(names: Sequence[str], uri: str | None, project: str, outputs: 
 
 
 @click.command("mlflow")
-@click.option("--port", default=5000, show_default=True)
+@click.option("--port", default=5000)
 @outputs_option
 def mlflow(port: int, outputs: Path) -> None:
     """Open MLflow's page (needs pip install 'memmlp[mlflow]')."""

@@ -86,7 +86,7 @@ class CommandGroup(click.Group):
         return super().resolve_command(ctx, args)
 
 
-@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.version_option(memmlp.__version__, prog_name="memmlp")
 def commands() -> None:
     """Mem-MLP: full-body motion from head and hands, and a platform for experiments with it.

@@ -61,7 +61,6 @@ device_option = click.option(
     "--device",
     default="auto",
     type=DeviceName(),
-    show_default=True,
     help="Device to compute on; auto selects a CUDA GPU if available.",
 )
 
@@ -101,7 +100,6 @@ outputs_option = click.option(
     type=PATH,
     default=Path("outputs"),
     envvar="MEMMLP_OUTPUTS",
-    show_default=True,
     help="Folder of the runs and data caches.",
 )
 source_option = click.option(
@@ -119,7 +117,7 @@ together_option = click.option(
 def add_page_options(port: int) -> Callable[[Command], Command]:
     """Add the options --port, with the default `port`, and --no-browser to a command that serves a page."""
     limits, help_text = click.IntRange(0, 65535), "Port of the page; 0 selects a free port."
-    number = click.option("--port", default=port, show_default=True, type=limits, help=help_text)
+    number = click.option("--port", default=port, type=limits, help=help_text)
     browser = click.option(
         "--no-browser", is_flag=True, help="Print the page's address without opening a browser."
     )
@@ -129,7 +127,6 @@ def add_page_options(port: int) -> Callable[[Command], Command]:
 host_option = click.option(
     "--host",
     default="127.0.0.1",
-    show_default=True,
     help="Address to serve at. At addresses other than localhost, every request needs the token.",
 )
 token_option = click.option(
@@ -177,7 +174,6 @@ format_option = click.option(
 body_option = click.option(
     "--body",
     default="builtin",
-    show_default=True,
     help="Body to use: builtin, or the path of an SMPL-H model.npz.",
 )
 strict_option = click.option(

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @click.argument("source")
 @click.option("--out", required=True, type=PATH, help="File to write, or folder if SOURCE is a folder.")
 @format_option
-@click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
+@click.option("--mode", default="stream", type=click.Choice(["stream", "window"]))
 @click.option(
     "--ik",
     type=click.Choice(["off", "lbfgs", "arms"]),

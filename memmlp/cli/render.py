@@ -41,17 +41,15 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
 @click.option(
     "--branch",
     default="rotation",
-    show_default=True,
     type=click.Choice(["rotation", "position"]),
     help="Branch to draw: rotation (forward kinematics with the head at its tracker), or position (the "
     "network's predicted positions).",
 )
-@click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
+@click.option("--mode", default="stream", type=click.Choice(["stream", "window"]))
 @click.option(
     "--from",
     "begin",
     default=0.0,
-    show_default=True,
     type=FiniteFloat(min=0),
     help="Start of the piece, seconds.",
 )
@@ -64,7 +62,6 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
 @click.option(
     "--poses",
     default=6,
-    show_default=True,
     type=click.IntRange(1, 20),
     help="Number of poses in a PNG, evenly spaced.",
 )

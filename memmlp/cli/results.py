@@ -41,7 +41,6 @@ def results() -> None:
     "--out",
     type=HomePath(file_okay=False),
     default=FOLDER / "data",
-    show_default=True,
     help="Folder for the results file.",
 )
 @click.option(
@@ -109,7 +108,6 @@ folder_option = click.option(
     "--folder",
     type=HomePath(file_okay=False),
     default=FOLDER,
-    show_default=True,
     help="Folder of the pages, with the subfolders data and templates.",
 )
 
@@ -234,7 +232,6 @@ def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence
     "--out",
     type=HomePath(file_okay=False),
     default=Path("searches"),
-    show_default=True,
     help="Folder for trials.csv and summary.md.",
 )
 @outputs_option

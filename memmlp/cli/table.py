@@ -53,7 +53,6 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     "--mode",
     type=click.Choice(list(SHOWN_MODES)),
     default="both",
-    show_default=True,
     help="Evaluation mode of the errors to show.",
 )
 @click.option(

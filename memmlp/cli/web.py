@@ -27,14 +27,12 @@ if TYPE_CHECKING:
 @click.option(
     "--clips",
     default=3,
-    show_default=True,
     type=click.IntRange(1, 50),
     help="Number of test clips to include from each run.",
 )
 @click.option(
     "--seconds",
     default=20.0,
-    show_default=True,
     type=FiniteFloat(1, 600),
     help="Maximum length of a clip in seconds; longer clips are cut to their middle.",
 )

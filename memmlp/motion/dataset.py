@@ -199,12 +199,10 @@ class MirroredDataset(MotionDataset):
         super().__init__(plain.frames, starts, lengths, names, [*plain.groups] * 2, sources)
 
     def read_stretches(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
-        """Read frames (B, length, 252) that end with frame `end` of each clip; see MotionDataset."""
         plain = super().read_stretches(clip, end, length)
         turned = (clip >= len(self) // 2).to(plain.device)
         return torch.where(turned[:, None, None], mirror_frames(plain), plain)
 
     def read_clip(self, index: int) -> Tensor:
-        """Return all frames (N, 252) of a clip."""
         plain = super().read_clip(index)
         return mirror_frames(plain) if index >= len(self) // 2 else plain

@@ -80,7 +80,6 @@ class Heading(HeadRelative):
         return torch.cat([super().find_origin(sparse), heading], -1)
 
     def convert_inputs_to_local(self, sparse: Tensor, origin: Tensor) -> Tensor:
-        """Convert world inputs (..., 54) to local coordinates."""
         sparse = super().convert_inputs_to_local(sparse, origin[..., :3])
         rotated = [
             _turn_vectors(sparse[..., SPARSE_ROTATION], origin, -1),
@@ -91,15 +90,12 @@ class Heading(HeadRelative):
         return torch.cat(rotated, -1)
 
     def convert_motion_to_local(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Convert world motion (..., 198) to local coordinates."""
         return self._turn_motion(super().convert_motion_to_local(motion, origin[..., :3]), origin, -1)
 
     def convert_motion_to_world(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Convert local motion (..., 198) to the world."""
         return super().convert_motion_to_world(self._turn_motion(motion, origin, 1), origin[..., :3])
 
     def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
-        """Convert joints' global rotations (..., 6 n), 6D, from local coordinates to the world."""
         return _turn_vectors(rotations, origin, 1)
 
     def _turn_motion(self, motion: Tensor, origin: Tensor, way: int) -> Tensor:

@@ -75,7 +75,6 @@ class OptimSettings(Settings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield invalid combinations of values; see Settings."""
         own = config["optim"]
         if own.get("final_lr", 0) > own["lr"]:
             yield f"optim.final_lr={own['final_lr']}: must be at most optim.lr={own['lr']}"
@@ -219,12 +218,10 @@ class Muon(Optim):
         return replace(other, other_lr=self.other_lr * lr / self.lr)
 
     def check_installed(self) -> None:
-        """Raise InputError if torch does not have Muon."""
         if not hasattr(torch.optim, "Muon"):
             raise InputError(f"optim=muon: needs torch 2.9 or newer, not {torch.__version__}")
 
     def build(self, groups: list[dict]) -> Optimizer:
-        """Make one optimiser from Muon and AdamW; see Optim."""
         self.check_installed()
         matrices, rest = _split_matrices(groups, least=1 if self.vectors == "muon" else 2)
         parts: list[Optimizer] = []
@@ -242,18 +239,15 @@ class ScheduleFree(Optim):
     weights itself; `schedule`, `final_lr`, `drop_at` and `ema` have no effect."""
 
     def compute_factor(self, step: int) -> float:
-        """Return the learning rate at a step as a fraction of `lr`."""
         return self.compute_warmup_factor(step)
 
     def check_installed(self) -> None:
-        """Raise InputError if the package schedulefree is not installed."""
         if find_spec("schedulefree") is None:
             raise InputError(
                 "optim=schedule_free: needs the package schedulefree; pip install 'memmlp[schedulefree]'"
             )
 
     def build(self, groups: list[dict]) -> Optimizer:
-        """Make the optimiser, ready to train; see Optim."""
         self.check_installed()
         from schedulefree import AdamWScheduleFree
 
@@ -262,7 +256,6 @@ class ScheduleFree(Optim):
         return optimiser
 
     def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
-        """Return the average that the optimiser maintains."""
         return ScheduleFreeAverage(module, optimiser)
 
 

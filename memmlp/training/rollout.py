@@ -90,7 +90,6 @@ class OwnPredictions(Rollout):
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
-        """Draw the batch of a training step, and predict its history."""
         clips, end = map(distributed.take_local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         drawn = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
@@ -145,7 +144,6 @@ class PersistentStreams(Rollout):
         self.register_buffer("lives", torch.zeros(streams, dtype=torch.bool))
 
     def begin(self, model: MotionModel) -> None:
-        """Allocate the streams' states."""
         for name, tensor in model.initial_state(1).items():
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
@@ -175,6 +173,5 @@ class PersistentStreams(Rollout):
         )
 
     def keep(self, state: State) -> None:
-        """Store the streams' states after a training step."""
         for name, tensor in state.items():
             self.get_buffer(f"state_{name}")[self.who] = distributed.gather_rows(tensor.detach())

@@ -96,7 +96,6 @@ class NetworkTraining(Training):
         device: torch.device,
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train a network; see Training."""
         task = self.make_task(architecture, data, prerequisite, device)
         train(task, self.optim, run, self.seed, "network", on_validation)
         if distributed.is_first():
@@ -153,12 +152,10 @@ class MotionTask(TrainingTask):
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
-        """Return the trainable parameters of the model and of the loss weighting."""
         trained = [p for p in self.model.parameters() if p.requires_grad]
         return [{"params": trained}, *self.loss.weighting.parameter_groups()]
 
     def step(self, step: int) -> StepResult:
-        """Compute the loss of a training step."""
         call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
         motion, state, losses = self.compute_training_outputs(call.sparse, call.state, call.true_frames)
         self.rollout.keep(state)
@@ -170,15 +167,12 @@ class MotionTask(TrainingTask):
         return StepResult(sum(losses.values(), loss), terms | losses, call.clips)
 
     def average_over_draws(self, measure: Callable[[], float]) -> float:
-        """Return the expected value of `measure` over the rollout's draws; see Rollout."""
         return self.rollout.average_over_draws(measure)
 
     def report(self) -> dict[str, float]:
-        """Return the weights of the loss terms."""
         return {f"weight_{name}": value for name, value in self.loss.weighting.weights().items()}
 
     def validate(self) -> dict[str, float]:
-        """Compute the stream-mode metrics on the validation split."""
         return self._validate(self.model)
 
 
@@ -195,7 +189,6 @@ class VQVAETraining(Training):
 
     @property
     def description(self) -> str:
-        """A short text about the training, for progress messages."""
         return "VQ-VAE: training, since the network's memory uses its code-vectors"
 
     def train(
@@ -207,7 +200,6 @@ class VQVAETraining(Training):
         device: torch.device,
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train the architecture's VQ-VAE; it does not have a prerequisite. See Training."""
         dataset = data.open("train").to(device)
         validation = data.open("val").to(device) if data.has("val") else None
         torch.manual_seed(self.seed)
@@ -240,7 +232,6 @@ class VQVAETask(TrainingTask):
         self.used = torch.zeros(len(model.codebook.vectors))
 
     def step(self, step: int) -> StepResult:
-        """Compute the loss on a batch of single frames."""
         clips, end = map(distributed.take_local_rows, self.sampler.draw(step))
         frames = self.normalizer.encode(self.dataset.read_stretches(clips, end, 1))[:, 0]
         terms, indices = self.model.compute_losses(frames, self.normalizer)
@@ -248,12 +239,10 @@ class VQVAETask(TrainingTask):
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     def report(self) -> dict[str, float]:
-        """Return the perplexity of the step's codes; see `compute_perplexity`."""
         return {"perplexity": compute_perplexity(self.used)}
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Compute Eq. 1 and the perplexity on the validation frames; {} without validation."""
         if self.validation is None:
             return {}
         frames = self.normalizer.encode(self.validation.frames)

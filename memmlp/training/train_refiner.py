@@ -99,7 +99,6 @@ class RefinerTraining(Training):
         device: torch.device,
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train a refiner, and write it together with the trained network; see Training."""
         assert prerequisite is not None
         plain = data.open("train").to(device)
         dataset = MirroredDataset(plain) if self.mirror else plain
@@ -149,7 +148,6 @@ class RefinerTask(TrainingTask):
         self.streamed, self._validate = torch.stack(streamed), validate
 
     def step(self, step: int) -> StepResult:
-        """Compute the loss on a batch of pieces."""
         drawn = torch.randint(len(self.frames), (self.batch,)).to(self.frames.device)
         sparse, truth = self.frames[drawn].split([SPARSE_DIM, self.frames.shape[-1] - SPARSE_DIM], -1)
         hidden = self.model.initial_state(len(drawn))[HIDDEN]
@@ -158,5 +156,4 @@ class RefinerTask(TrainingTask):
         return StepResult(loss, terms, self.clips[drawn])
 
     def validate(self) -> dict[str, float]:
-        """Compute the stream-mode metrics of network and refiner on the validation split."""
         return self._validate()

@@ -152,7 +152,6 @@ class SAGEPartTraining(Training):
 
     @property
     def description(self) -> str:
-        """A short text about the training, for progress messages."""
         return f"{self.kind.replace('_', ' ')}: training for {self.network.optim.steps} steps"
 
     def train(
@@ -164,7 +163,6 @@ class SAGEPartTraining(Training):
         device: torch.device,
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train the part and write it with the parts before it; see Training."""
         before = checkpoint.read(prerequisite)[0] if prerequisite else {}
         dataset = data.open("train").to(device)
         torch.manual_seed(self.network.seed)
@@ -204,7 +202,6 @@ class SAGEDecoderTraining(SAGEPartTraining):
         device: torch.device,
         on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train the decoder and write it together with the diffusion models; see Training."""
         fixed = replace(architecture, trained_parts=("upper", "lower"))
         return self.network.train(fixed, data, prerequisite, run, device, on_validation)
 
@@ -231,7 +228,6 @@ class SAGEPartTask(TrainingTask):
             self.validation = validation.read_stretches(*drawn, frames)
 
     def step(self, step: int) -> StepResult:
-        """Compute the losses on a batch of windows."""
         clips, end = map(distributed.take_local_rows, self.sampler.draw(step))
         terms = self.objective(self.dataset.read_stretches(clips, end, self.frames), True)
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)

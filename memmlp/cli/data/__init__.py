@@ -31,9 +31,9 @@ data.add_command(verify)
 
 @data.command("synth")
 @click.option("--out", required=True, type=PATH, help="Folder for the clips.")
-@click.option("--minutes", default=10.0, show_default=True, help="Total length of all clips.")
-@click.option("--seed", default=0, show_default=True)
-@click.option("--fps", default=60.0, show_default=True, help="Frame rate of the clips.")
+@click.option("--minutes", default=10.0, help="Total length of all clips.")
+@click.option("--seed", default=0)
+@click.option("--fps", default=60.0, help="Frame rate of the clips.")
 def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
     """Write procedural motion as AMASS npz.
 
@@ -50,9 +50,7 @@ def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
 @data.command("show")
 @click.argument("source", type=PATH)
 @click.option("--out", required=True, type=PATH, help="PNG file to write.")
-@click.option(
-    "--clips", default=12, show_default=True, type=click.IntRange(1, 200), help="Maximum number of clips."
-)
+@click.option("--clips", default=12, type=click.IntRange(1, 200), help="Maximum number of clips.")
 @body_option
 def show(source: Path, out: Path, clips: int, body: str) -> None:
     """Draw clips, each at three moments.

@@ -35,7 +35,6 @@ up_option = click.option(
 @click.option(
     "--floor",
     default="auto",
-    show_default=True,
     metavar="auto|none|METRES",
     help="Floor height in the files. auto: the height of the lowest stable foot contact; none: heights are "
     "unchanged.",

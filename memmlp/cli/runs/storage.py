@@ -109,7 +109,6 @@ def export(run: str, out: Path | None, outputs: Path) -> None:
     "--max-gb",
     type=FiniteFloat(0, min_open=True),
     default=4.0,
-    show_default=True,
     help="Maximum size in GB.",
 )
 @outputs_option

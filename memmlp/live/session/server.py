@@ -129,7 +129,6 @@ class LiveHandler(PageHandler):
     server: LiveServer
 
     def answer(self, path: str, query: Mapping[str, str]) -> None:
-        """Send a file of the page, or the stream of events."""
         name = path or "index.html"
         if name == "events":
             self.send_events(self.server.hub.stream_events())
@@ -171,5 +170,4 @@ class LiveServer(PageServer):
         super().__init__(LiveHandler, port, host, token)
 
     def end_events(self) -> None:
-        """End the events of all pages."""
         self.hub.close()

@@ -49,8 +49,6 @@ class AsfAmc(Recording):
     first_frame: int
 
     def compute_kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3), metres, of all frames. An
-        end site has the rotation of its bone."""
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.zeros((len(self.nodes), len(self), 3))
         first = 0
@@ -75,7 +73,6 @@ class AsfAmc(Recording):
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
     def compute_pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose (see `Recording`)."""
         values: list[float] = []
         for name, bone in zip(self.nodes, self.bones, strict=False):
             count = sum(dof in ROTATIONS for dof in bone.dofs)

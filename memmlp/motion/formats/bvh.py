@@ -51,8 +51,6 @@ class Bvh(Recording):
     channels: tuple[tuple[str, ...], ...]
 
     def compute_kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compute global rotations (N, nodes, 3, 3) and positions (N, nodes, 3) of all frames. An end site
-        has the rotation of its joint."""
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.empty((len(self.nodes), len(self), 3))
         first = 0
@@ -77,7 +75,6 @@ class Bvh(Recording):
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
     def compute_pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        """Compute global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose (see `Recording`)."""
         values: list[float] = []
         for joint, channels in enumerate(self.channels):
             count = sum(channel.endswith("rotation") for channel in channels)

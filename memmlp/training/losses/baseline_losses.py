@@ -50,7 +50,6 @@ class AGRoLLoss(Loss):
         self.weighting = FixedWeights({"rotation_all": 1.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the rotation term for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         origin = normalizer.find_origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         return {"rotation_all": self.error(error[..., ROTATION])}
@@ -151,11 +150,9 @@ class LossOfNetwork(Loss):
         self.weighting = FixedWeights({})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return an empty dict."""
         return {}
 
     def forward(
         self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
     ) -> tuple[Tensor, Terms]:
-        """Return 0 and an empty dict."""
         return motion.new_zeros(()), {}

@@ -44,7 +44,6 @@ class PositionHandTermSettings(Settings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield a problem if the predictor does not have positions; see Settings."""
         if not getattr(find_chosen_settings(config, "predictor"), "positions", True):
             yield f"hand=position: must be fk or off with predictor={config['predictor']['name']}"
 

@@ -223,7 +223,6 @@ class TermsLossSettings(CompleteLossSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield the terms that need more frames than the network learns of a window; see Settings."""
         newest = getattr(find_chosen_settings(config, "model"), "learns_newest_frame", False)
         frames = 1 if newest else config["model"]["frames"]
         for name, needed in TERM_FRAMES.items():
