@@ -48,7 +48,7 @@ def write(folder: Path) -> None:
 
 def make_command_page() -> str:
     """Return the page of all commands with their options."""
-    context = click.Context(commands, info_name="memmlp")
+    context = click.Context(commands, info_name="memmlp", **commands.context_settings)
     parts = [
         "# Commands",
         inspect.cleandoc(commands.help or ""),

@@ -100,12 +100,7 @@ class LiveOptions(NamedTuple):
     type=click.Choice(["amass", "openxr", "unity"]),
     help="Frame of reference of the packets' poses.",
 )
-@click.option(
-    "--hz",
-    default=HZ,
-    type=FiniteFloat(10, 1000),
-    help="Sampling rate of a clip, Hz.",
-)
+@click.option("--hz", default=HZ, type=FiniteFloat(10, 1000), help="Sampling rate of a clip, Hz.")
 @click.option(
     "--height",
     type=FiniteFloat(0.5, 2.5),

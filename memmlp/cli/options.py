@@ -172,9 +172,7 @@ format_option = click.option(
     help="Format of the files.  [default: from the suffix .bvh, .npz or .glb of --out]",
 )
 body_option = click.option(
-    "--body",
-    default="builtin",
-    help="Body to use: builtin, or the path of an SMPL-H model.npz.",
+    "--body", default="builtin", help="Body to use: builtin, or the path of an SMPL-H model.npz."
 )
 strict_option = click.option(
     "--strict", is_flag=True, help="Stop at the first bad file instead of skipping it."

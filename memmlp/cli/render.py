@@ -46,13 +46,7 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
     "network's predicted positions).",
 )
 @click.option("--mode", default="stream", type=click.Choice(["stream", "window"]))
-@click.option(
-    "--from",
-    "begin",
-    default=0.0,
-    type=FiniteFloat(min=0),
-    help="Start of the piece, seconds.",
-)
+@click.option("--from", "begin", default=0.0, type=FiniteFloat(min=0), help="Start of the piece, seconds.")
 @click.option(
     "--to",
     "end",
@@ -60,10 +54,7 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
     help="End of the piece, seconds.  [default: the clip's end]",
 )
 @click.option(
-    "--poses",
-    default=6,
-    type=click.IntRange(1, 20),
-    help="Number of poses in a PNG, evenly spaced.",
+    "--poses", default=6, type=click.IntRange(1, 20), help="Number of poses in a PNG, evenly spaced."
 )
 @plugins_option
 @outputs_option

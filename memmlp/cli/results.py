@@ -38,10 +38,7 @@ def results() -> None:
 @click.argument("name", metavar="SWEEP")
 @click.argument("overrides", nargs=-1)
 @click.option(
-    "--out",
-    type=HomePath(file_okay=False),
-    default=FOLDER / "data",
-    help="Folder for the results file.",
+    "--out", type=HomePath(file_okay=False), default=FOLDER / "data", help="Folder for the results file."
 )
 @click.option(
     "--untrained",

@@ -45,9 +45,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     help="Output format.  [default: a table for the screen]",
 )
 @click.option(
-    "--out",
-    type=HomePath(dir_okay=False),
-    help="File to write the table to; its suffix sets the format.",
+    "--out", type=HomePath(dir_okay=False), help="File to write the table to; its suffix sets the format."
 )
 @click.option(
     "--mode",

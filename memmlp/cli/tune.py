@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 @add_worker_options
 @click.option("--status", is_flag=True, help="Only show the search's progress.")
 @click.option(
-    "--config-dir",
-    type=PATH,
-    help="Folder of additional configs; they can refer to your own classes.",
+    "--config-dir", type=PATH, help="Folder of additional configs; they can refer to your own classes."
 )
 @plugins_option
 @outputs_option

@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 @click.argument("runs", nargs=-1, required=True)
 @click.option("--out", required=True, type=PATH, help="Folder to write the site into.")
 @click.option(
-    "--clips",
-    default=3,
-    type=click.IntRange(1, 50),
-    help="Number of test clips to include from each run.",
+    "--clips", default=3, type=click.IntRange(1, 50), help="Number of test clips to include from each run."
 )
 @click.option(
     "--seconds",
@@ -38,13 +35,7 @@ if TYPE_CHECKING:
 )
 @plugins_option
 @outputs_option
-def web(
-    runs: tuple[str, ...],
-    out: Path,
-    clips: int,
-    seconds: float,
-    outputs: Path,
-) -> None:
+def web(runs: tuple[str, ...], out: Path, clips: int, seconds: float, outputs: Path) -> None:
     """Make a static web site of finished RUNS (ids, beginnings of ids, or folders).
 
     In a browser, including a headset's, the site plays test clips and shows the user's body in a mirror, with

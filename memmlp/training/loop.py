@@ -251,11 +251,7 @@ def save(
 
 
 def resume(
-    task: TrainingTask,
-    optimiser: torch.optim.Optimizer,
-    average: Average,
-    best: BestWeights,
-    run: Run,
+    task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, best: BestWeights, run: Run
 ) -> tuple[int, float]:
     """Load the checkpoint if there is one; return the finished steps, and the seconds of training."""
     state = checkpoint.read(run.checkpoint) if distributed.is_first() and run.checkpoint.exists() else None

@@ -177,11 +177,7 @@ def make_prerequisites(experiment: Experiment, data: PreparedMotion, last: str |
 
 
 def find_or_train(
-    experiment: Experiment,
-    training: Training,
-    identity: Identity,
-    data: PreparedMotion,
-    before: Run | None,
+    experiment: Experiment, training: Training, identity: Identity, data: PreparedMotion, before: Run | None
 ) -> Run:
     """Return the prerequisite run with that identity; train it from the run `before` if necessary."""
     run = Run.from_id(experiment.outputs, identity.id)

@@ -7,13 +7,7 @@ from pathlib import Path
 import click
 
 from memmlp.cli.data.importing import import_, skeleton, verify
-from memmlp.cli.data.printing import (
-    show_exported,
-    show_manifest,
-    show_pairs,
-    show_rates,
-    show_skipped,
-)
+from memmlp.cli.data.printing import show_exported, show_manifest, show_pairs, show_rates, show_skipped
 from memmlp.cli.options import PATH, FiniteFloat, body_option, format_option, strict_option
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import escape_interpolations
