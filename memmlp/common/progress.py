@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, TypeVar
 
@@ -32,13 +32,19 @@ def print_unless_terminal(line: str) -> None:
 
 
 @contextmanager
-def send_announcements_to(listener: Callable[[str], None] = print_unless_terminal) -> Iterator[None]:
-    """Send announcements and progress lines of this context to a listener."""
-    token = _listener.set(listener)
+def _set(variable: ContextVar[T], value: T) -> Iterator[None]:
+    token = variable.set(value)
     try:
         yield
     finally:
-        _listener.reset(token)
+        variable.reset(token)
+
+
+def send_announcements_to(
+    listener: Callable[[str], None] = print_unless_terminal,
+) -> AbstractContextManager[None]:
+    """Send announcements and progress lines of the context to a listener."""
+    return _set(_listener, listener)
 
 
 def announce(line: str) -> None:
@@ -53,14 +59,9 @@ def notify(line: str) -> None:
         (print_to_stderr if listener is print_unless_terminal else listener)(line)
 
 
-@contextmanager
-def label_progress(name: str) -> Iterator[None]:
-    """Label all progress bars of this context with the name of the larger work, such as a validation."""
-    token = _label.set(name)
-    try:
-        yield
-    finally:
-        _label.reset(token)
+def label_progress(name: str) -> AbstractContextManager[None]:
+    """Label all progress bars of the context with the name of the larger work, such as a validation."""
+    return _set(_label, name)
 
 
 class ProgressCounter:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 from hydra.core.object_type import ObjectType
@@ -64,13 +65,9 @@ class ComponentSource(ConfigSource):
         group = config_path.strip("/")
         if results_filter == ObjectType.GROUP:
             return []
-        return (
-            sorted(SCHEMAS)
-            if group == SCHEMA
-            else ["default"]
-            if group in ONLY
-            else list_component_names(group)
-        )
+        if group == SCHEMA:
+            return sorted(SCHEMAS)
+        return ["default"] if group in ONLY else list_component_names(group)
 
 
 def _load_option(group: str, name: str) -> tuple[str | None, DictConfig]:
@@ -102,25 +99,22 @@ def _choose_size(
     return chosen
 
 
-def _choose_reading(default: Any, literal: Any, *, _root_: DictConfig) -> Any:
-    return literal if _root_.profile.reading == "literal" else default
-
-
 def _choose_movement(weight: float, *, _root_: DictConfig) -> float | None:
     one_frame = getattr(find_chosen_settings(_root_, "model"), "learns_newest_frame", False)
     return None if one_frame else weight
 
 
-def _list_even_layers(depth: int) -> list[int]:
-    return list(
-        range(2, min(depth, 8) + 1, 2)
-    )  # only the first eight layers, also in deeper networks (Table 9)
-
-
 def register_components() -> None:
     """Register the components with Hydra, and the resolvers of their defaults with OmegaConf."""
     Plugins.instance().register(ComponentSource)
-    OmegaConf.register_new_resolver("size", _choose_size, replace=True)
-    OmegaConf.register_new_resolver("reading", _choose_reading, replace=True)
-    OmegaConf.register_new_resolver("movement", _choose_movement, replace=True)
-    OmegaConf.register_new_resolver("even_layers", _list_even_layers, replace=True)
+    resolvers: dict[str, Callable[..., Any]] = {
+        "size": _choose_size,
+        "reading": lambda default, literal, *, _root_: (
+            literal if _root_.profile.reading == "literal" else default
+        ),
+        "movement": _choose_movement,
+        # only the first eight layers, also in deeper networks (Table 9)
+        "even_layers": lambda depth: list(range(2, min(depth, 8) + 1, 2)),
+    }
+    for name, resolver in resolvers.items():
+        OmegaConf.register_new_resolver(name, resolver, replace=True)

@@ -128,23 +128,17 @@ class ListDataConfig(DataConfig):
     root: str = setting(existing("folder"))
     synth: Settings | None = None
     partial: bool = False
-    split: ListSplitConfig = group(ListSplitConfig)
+    split: Any = group(ListSplitConfig)
 
 
 @dataclass
-class SubsetDataConfig(DataConfig):
-    root: str = setting(existing("folder"))
-    synth: Settings | None = None
-    partial: bool = False
-    split: SubsetSplitConfig = group(SubsetSplitConfig)
+class SubsetDataConfig(ListDataConfig):
+    split: Any = group(SubsetSplitConfig)
 
 
 @dataclass
-class PersonDataConfig(DataConfig):
-    root: str = setting(existing("folder"))
-    synth: Settings | None = None
-    partial: bool = False
-    split: PersonSplitConfig = group(PersonSplitConfig)
+class PersonDataConfig(ListDataConfig):
+    split: Any = group(PersonSplitConfig)
 
 
 @dataclass
@@ -347,10 +341,4 @@ def _merge_typed(kind: Any, content: Mapping[str, Any]) -> Any:
 
 
 def _choose_data_schema(content: Mapping[str, Any]) -> type:
-    kinds = {
-        "seeded": SeededDataConfig,
-        "lists": ListDataConfig,
-        "subsets": SubsetDataConfig,
-        "persons": PersonDataConfig,
-    }
-    return SynthDataConfig if content.get("synth") else kinds[content["split"]["name"]]
+    return SCHEMAS["data_synth" if content.get("synth") else f"data_{content['split']['name']}"]

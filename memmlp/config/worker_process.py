@@ -17,20 +17,16 @@ def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | No
     ends with it. A worker without it, on another machine, finishes a closed plan, and leaves an open plan
     when the controller no longer touches the plan's file. Return a line that explains why a worker that needs
     a `gpu` has none and did nothing; else None."""
-    if gpu and (line := explain_missing_gpu()):
-        return line
+    if gpu:
+        from memmlp.training import devices  # it imports torch
+
+        if line := devices.describe_missing_gpu():
+            return line
     should_continue = (
         partial(Presence.is_alive, Path(controller)) if controller else partial(has_controller, Path(path))
     )
     work_on_plan(Path(path), partial(perform_task, Path(path), threads), should_continue)
     return None
-
-
-def explain_missing_gpu() -> str | None:
-    """Return a line that explains why torch finds no GPU; None if it finds one."""
-    from memmlp.training import devices  # it imports torch
-
-    return devices.describe_missing_gpu()
 
 
 def perform_task(path: Path, threads: int, plan: Plan, task: RunTask) -> None:

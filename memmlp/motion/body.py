@@ -76,14 +76,9 @@ _REST = {
 
 def make_builtin_rest_joints() -> np.ndarray:
     """Return the rest positions (22, 3) of the built-in adult: metres, SMPL's body frame, pelvis at 0."""
-
-    def get_rest_position(name: str) -> tuple[float, float, float]:
-        if name.startswith("right_"):
-            x, y, z = _REST["left_" + name.removeprefix("right_")]
-            return -x, y, z
-        return _REST[name]
-
-    return np.array([get_rest_position(name) for name in JOINTS])
+    joints = np.array([_REST[name.replace("right_", "left_")] for name in JOINTS])
+    joints[[name.startswith("right_") for name in JOINTS], 0] *= -1
+    return joints
 
 
 def load_rest_joints(body: str | Path) -> np.ndarray:
@@ -108,12 +103,10 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
     return joints[:N_JOINTS]
 
 
-def _swap_side(name: str) -> str:
-    side, _, rest = name.partition("_")
-    return {"left": f"right_{rest}", "right": f"left_{rest}"}.get(side, name)
-
-
-SWAPPED = tuple(JOINTS.index(_swap_side(name)) for name in JOINTS)
+_OTHER_SIDE = {"left": "right", "right": "left"}
+SWAPPED = tuple(
+    JOINTS.index("_".join(_OTHER_SIDE.get(part, part) for part in name.split("_"))) for name in JOINTS
+)
 """The index of each joint's mirrored joint: left and right are exchanged."""
 
 

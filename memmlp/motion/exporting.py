@@ -143,11 +143,13 @@ def export(
     rest = load_rest_joints(body)
     if plan.format.has_bones:
         check_imported_body([target.source for target in plan.targets], rest, f"--body {body}")
-
-    def resample_clip(target: ExportTarget, clip: Clip) -> Clip:
-        return clip if fps is None else resample(clip, fps)[0]
-
-    return convert_and_export(plan, rest, resample_clip, lambda names, clips: clips, strict=strict)
+    return convert_and_export(
+        plan,
+        rest,
+        lambda target, clip: clip if fps is None else resample(clip, fps)[0],
+        lambda names, clips: clips,
+        strict=strict,
+    )
 
 
 def convert_and_export(

@@ -141,12 +141,12 @@ def list_differing_files(before: Mapping[str, str], after: Mapping[str, str]) ->
 @functools.cache
 def _read_package_code() -> dict[str, bytes]:
     files = {path.relative_to(PACKAGE): path for path in sorted(PACKAGE.rglob("*.py"))}
-    return {name.as_posix(): path.read_bytes() for name, path in files.items() if _affects_results(name)}
 
+    def affects_results(path: Path) -> bool:
+        unused = path.parts[0].startswith("_") or any(map(path.is_relative_to, NOT_NUMBERS))
+        return path.as_posix() in WIRING or not unused
 
-def _affects_results(path: Path) -> bool:
-    unused = path.parts[0].startswith("_") or any(map(path.is_relative_to, NOT_NUMBERS))
-    return path.as_posix() in WIRING or not unused
+    return {name.as_posix(): path.read_bytes() for name, path in files.items() if affects_results(name)}
 
 
 @functools.cache

@@ -80,20 +80,13 @@ def find_combined_solvers(reports: Sequence[Mapping[str, Any]]) -> dict[str, str
 
 def keep_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Remove the branch `combined` where its inverse kinematics differs from the mode's last report."""
-    last = find_combined_solvers(reports)
-
-    def fits(report: Mapping[str, Any]) -> bool:
-        return get_solver_name(report.get("settings") or {}) == last.get(str(report.get("mode")))
-
-    return [dict(report) if fits(report) else _remove_combined(report) for report in reports]
-
-
-def _remove_combined(report: Mapping[str, Any]) -> dict[str, Any]:
-    mean, *clips = (
-        {branch: errors for branch, errors in row.items() if branch != COMBINED}
-        for row in (report["mean"], *report.get("clips", ()))
-    )
-    return {**report, "mean": mean, "clips": clips}
+    last, kept = find_combined_solvers(reports), []
+    for report in reports:
+        rows = [report["mean"], *report.get("clips", ())]
+        if get_solver_name(report.get("settings") or {}) != last.get(str(report.get("mode"))):
+            rows = [{key: errors for key, errors in row.items() if key != COMBINED} for row in rows]
+        kept.append({**report, "mean": rows[0], "clips": rows[1:]})
+    return kept
 
 
 def add_solver_names(results: Mapping[str, Any], solvers: Mapping[str, str | None]) -> dict[str, Any]:

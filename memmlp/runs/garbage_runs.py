@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from memmlp.common.files import read_json
 from memmlp.common.lease import is_alive
@@ -35,7 +35,8 @@ def find_garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[GarbageR
     for run in runs:
         kind, reason = _find_deletion_reason(run, orphans)
         if kind in requested and not _has_notes(run) and run.state(False) != "running":
-            candidates[run.id] = GarbageRun(run, kind, reason, _sum_file_sizes(run.folder))
+            size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file())
+            candidates[run.id] = GarbageRun(run, kind, reason, size)
     while candidates.keys() & (used := _list_prerequisites(run for run in runs if run.id not in candidates)):
         candidates = {run_id: one for run_id, one in candidates.items() if run_id not in used}
     return list(candidates.values())
@@ -69,7 +70,7 @@ def _find_deletion_reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, st
 def _find_orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     """Return the reason why a run is an orphan, by run id: a prerequisite run that is in no plan and that no
     run uses, or a folder of a run that never started."""
-    planned = {task["id"] for path in _list_plans(outputs) for task in _read_entries(path, "tasks")}
+    planned = {run_id for path in _list_plans(outputs) for run_id in _read_planned_ids(path)}
     used = _list_prerequisites(runs) | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
     unused = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
@@ -85,17 +86,12 @@ def _list_plans(outputs: Path) -> Iterator[Path]:
             yield path.with_suffix(".json")
 
 
-def _read_entries(path: Path, key: str) -> Iterator[Mapping[str, Any]]:
-    entries = read_json(path).get(key)
-    for one in entries if isinstance(entries, list) else ():
-        if isinstance(one, dict) and isinstance(one.get("id"), str):
-            yield one
+def _read_planned_ids(path: Path) -> set[str]:
+    tasks = read_json(path).get("tasks")
+    ids = [one.get("id") for one in tasks if isinstance(one, dict)] if isinstance(tasks, list) else []
+    return {one for one in ids if isinstance(one, str)}
 
 
 def _has_notes(run: Run) -> bool:
     notes = read_notes(run)
     return bool(notes.tags or notes.note)
-
-
-def _sum_file_sizes(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any, Self
@@ -332,7 +332,7 @@ class ComposedOptimiser(Optimizer):
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
         """Take a step of each part; a closure is not supported."""
-        with multiply_in_float32():
+        with nullcontext() if has_bfloat16_products() else Float32Products():
             for part in self.parts:
                 part.step()
 
@@ -357,11 +357,6 @@ class Float32Products(TorchFunctionMode):
         if func in MATRIX_PRODUCTS and all(map(_is_bfloat16_on_cpu, args)):
             return func(*(tensor.float() for tensor in args), **(kwargs or {})).bfloat16()
         return func(*args, **(kwargs or {}))
-
-
-def multiply_in_float32() -> AbstractContextManager[object]:
-    """Return `Float32Products` on a processor without bfloat16 instructions, otherwise an empty context."""
-    return nullcontext() if has_bfloat16_products() else Float32Products()
 
 
 @functools.cache

@@ -73,7 +73,7 @@ class RunRequest:
     def _run_chain(self) -> list[tuple[str, dict[str, Any]]]:
         """The kind and the identifying config of each required run, in training order. A frozen VQ-VAE's run
         covers its config; of a joint VQ-VAE, only the keys of its architecture count."""
-        config, codes = self.config, find_vqvae_training(self.config)
+        config, codes = self.config, getattr(find_chosen_settings(self.config, "memory"), "codes", None)
         network_config = {key: value for key, value in config.items() if key != "vqvae"}
         if codes == "joint":
             network_config["vqvae"] = {key: config["vqvae"][key] for key in VQVAE_SHAPE}
@@ -88,11 +88,6 @@ class RunRequest:
             vqvae |= {"data": {"mirror": True}} if config["data"].get("mirror") else {}
             return [("vqvae", vqvae), (NETWORK, network_config)]
         return [(NETWORK, network_config)]
-
-
-def find_vqvae_training(config: Mapping[str, Any]) -> str | None:
-    """Return the training of the memory's VQ-VAE, "frozen" or "joint"; None without a VQ-VAE."""
-    return getattr(find_chosen_settings(config, "memory"), "codes", None) or None
 
 
 def remove_refiner(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -50,7 +50,7 @@ from memmlp.training.request import (
     list_missing_modes,
     read_results,
 )
-from memmlp.training.train_network import NetworkTraining, Training
+from memmlp.training.train_network import NetworkTraining, Training, TrainingJob
 from memmlp.training.train_refiner import RefinerTraining
 
 
@@ -87,6 +87,15 @@ def run_in_processes(experiment: Experiment) -> Outcome | None:
     return outcome
 
 
+def make_job(
+    experiment: Experiment, data: PreparedMotion, before: Run | None, run: Run,
+    on_validation: ValidationCallback | None = None,
+) -> TrainingJob:  # fmt: skip
+    """Return the job of training a run from the weights of the run `before`."""
+    weights = before.weights() if before else None
+    return TrainingJob(experiment.architecture, data, weights, run, experiment.device, on_validation)
+
+
 def _train_named_stages(experiment: Experiment) -> None:
     """Train the stages that the first process broadcasts, until it broadcasts "end"."""
     while (stage := distributed.broadcast("")) != "end":
@@ -95,8 +104,7 @@ def _train_named_stages(experiment: Experiment) -> None:
         runs = [Run.from_id(experiment.outputs, identity.id) for identity in identities]
         number = [identity.kind for identity in identities].index(stage)
         training = (*experiment.prerequisites, experiment.training)[number]
-        weights = runs[number - 1].weights() if number else None
-        training.train(experiment.architecture, data, weights, runs[number], experiment.device)
+        training.train(make_job(experiment, data, runs[number - 1] if number else None, runs[number]))
     distributed.disconnect()
 
 
@@ -188,9 +196,8 @@ def find_or_train(
             begin_run(experiment, run, identity, dict(identity.config), before)
             run.write_manifest({"partial": describe_missing_data(experiment.config, data)})
             announce(f"{training.description} (run {run.id})")
-            weights = before.weights() if before else None
             distributed.broadcast(training.kind)  # tells the other processes what to train
-            errors = training.train(experiment.architecture, data, weights, run, experiment.device)
+            errors = training.train(make_job(experiment, data, before, run))
             write_json(run.results_path, {"val": errors})
             run.finish(("model.safetensors", "results.json"))
     return run
@@ -234,9 +241,8 @@ def train_run(
     run.write_manifest(facts | collect_data_warnings(experiment.config, data))
     run.request_stages(experiment.stage_ids)
     run.clear_stages()
-    weights = before.weights() if before else None
     distributed.broadcast(NETWORK)  # tells the other processes what to train
-    experiment.training.train(experiment.architecture, data, weights, run, experiment.device, on_validation)
+    experiment.training.train(make_job(experiment, data, before, run, on_validation))
     run.finish(("model.safetensors",))
 
 
@@ -251,11 +257,8 @@ def evaluate_run(experiment: Experiment, run: Run, data: PreparedMotion, modes: 
             settings = select_evaluation_settings(experiment.config, mode, experiment.motion.groups_digest)
             name = experiment.evaluations[mode]
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
-            report |= {
-                "component_versions": find_evaluation_versions(settings),
-                **describe_machine(experiment),
-                **describe_user_code(experiment),
-            }
+            report["component_versions"] = find_evaluation_versions(settings)
+            report |= describe_machine(experiment) | describe_user_code(experiment)
             write_report(run.evaluation(name), report | experiment.evaluation.report(model, test, mode))
         if not run.picture.exists() and find_spec("matplotlib"):
             draw_first_clip(model, test, run.picture)
@@ -299,15 +302,12 @@ def begin_run(
     prerequisite run's weights (`before`) in the manifest."""
     above = identity.prerequisite
     counting: Mapping[str, Any] = {**(above.config if above else {}), **identity.config}
+    origin: dict[str, Any] = {}
+    if before:
+        origin[PREREQUISITES] = list_prerequisite_origins(before.manifest, before.weights_digest)
+        origin["prerequisite_tflop"] = before.manifest.get("tflop")
     facts = {
-        **(
-            {
-                PREREQUISITES: list_prerequisite_origins(before.manifest, before.weights_digest),
-                "prerequisite_tflop": before.manifest.get("tflop"),
-            }
-            if before
-            else {}
-        ),
+        **origin,
         "component_versions": identity.component_versions,
         **describe_machine(experiment),
         "processes": distributed.world_size(),

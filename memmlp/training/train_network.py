@@ -29,6 +29,19 @@ from memmlp.training.rollout import Rollout
 VALIDATION_PIECE = 240  # frames, 4 s: validation streams through pieces of clips of this length
 
 
+@dataclass(frozen=True)
+class TrainingJob:
+    """The inputs of a training, and the run to train. `prerequisite` is the weights file of the prerequisite
+    run, such as a frozen VQ-VAE. `on_validation` is called after each validation."""
+
+    architecture: Architecture
+    data: PreparedMotion
+    prerequisite: Path | None
+    run: Run
+    device: torch.device
+    on_validation: ValidationCallback | None = None
+
+
 class Training:
     """The interface of trainings, which train the weights of a run of this `kind` (see `Identity`)."""
 
@@ -39,18 +52,9 @@ class Training:
         """A short text about the training, for progress messages."""
         return self.kind
 
-    def train(
-        self,
-        architecture: Architecture,
-        data: PreparedMotion,
-        prerequisite: Path | None,
-        run: Run,
-        device: torch.device,
-        on_validation: ValidationCallback | None = None,
-    ) -> dict[str, float]:
-        """Train, from the run's checkpoint if there is one, and write the weights to the run's folder.
-        `prerequisite` is the weights file of the prerequisite run, such as a frozen VQ-VAE. Return the
-        validation errors of the kept weights; empty in a process that does not validate."""
+    def train(self, job: TrainingJob) -> dict[str, float]:
+        """Train, from the run's checkpoint if there is one, and write the weights to the run's folder. Return
+        the validation errors of the kept weights; empty in a process that does not validate."""
         raise NotImplementedError
 
 
@@ -65,6 +69,12 @@ def make_validation(
     if count is not None and count < len(pieces):
         pieces = [pieces[i * len(pieces) // count] for i in range(count)]
     return lambda network: modes.measure_stream(network, pieces, metrics)
+
+
+def write_weights(run: Run, model: nn.Module) -> None:
+    """Write the weights of a trained module to its run, in the first process."""
+    if distributed.is_first():
+        checkpoint.write(run.model, checkpoint.collect_module_tensors("model", model), {})
 
 
 def read_kept_errors(run: Run) -> dict[str, float]:
@@ -87,20 +97,11 @@ class NetworkTraining(Training):
     metrics: UserMetrics = field(default_factory=dict)
     mirror: bool = False
 
-    def train(
-        self,
-        architecture: Architecture,
-        data: PreparedMotion,
-        prerequisite: Path | None,
-        run: Run,
-        device: torch.device,
-        on_validation: ValidationCallback | None = None,
-    ) -> dict[str, float]:
-        task = self.make_task(architecture, data, prerequisite, device)
-        train(task, self.optim, run, self.seed, "network", on_validation)
-        if distributed.is_first():
-            checkpoint.write(run.model, checkpoint.collect_module_tensors("model", task.model), {})
-        return read_kept_errors(run)
+    def train(self, job: TrainingJob) -> dict[str, float]:
+        task = self.make_task(job.architecture, job.data, job.prerequisite, job.device)
+        train(task, self.optim, job.run, self.seed, "network", job.on_validation)
+        write_weights(job.run, task.model)
+        return read_kept_errors(job.run)
 
     def make_task(
         self,
@@ -191,26 +192,18 @@ class VQVAETraining(Training):
     def description(self) -> str:
         return "VQ-VAE: training, since the network's memory uses its code-vectors"
 
-    def train(
-        self,
-        architecture: Architecture,
-        data: PreparedMotion,
-        prerequisite: Path | None,
-        run: Run,
-        device: torch.device,
-        on_validation: ValidationCallback | None = None,
-    ) -> dict[str, float]:
+    def train(self, job: TrainingJob) -> dict[str, float]:
+        data, device = job.data, job.device
         dataset = data.open("train").to(device)
         validation = data.open("val").to(device) if data.has("val") else None
         torch.manual_seed(self.seed)
-        normalizer = architecture.make_normalizer(data.manifest, dataset.frames).to(device)
-        model = architecture.vqvae().to(device)
+        normalizer = job.architecture.make_normalizer(data.manifest, dataset.frames).to(device)
+        model = job.architecture.vqvae().to(device)
         optim = self.optim(len(dataset.frames))
         training = MirroredDataset(dataset) if self.mirror else dataset
         task = VQVAETask(model, normalizer, training, validation, optim, self.seed)
-        train(task, optim, run, self.seed, "VQ-VAE", on_validation)
-        if distributed.is_first():
-            checkpoint.write(run.model, checkpoint.collect_module_tensors("model", model), {})
+        train(task, optim, job.run, self.seed, "VQ-VAE", job.on_validation)
+        write_weights(job.run, model)
         return task.validate()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,17 +15,19 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import HANDS, HEAD, ROOT, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
-from memmlp.motion.motion_source import PreparedMotion
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks import checkpoint
-from memmlp.networks.architectures import Architecture
 from memmlp.networks.refiner import HIDDEN, RefinedModel, SAGERefinerSettings
-from memmlp.runs.run import Run
-from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
+from memmlp.training.loop import StepResult, TrainingTask, train
 from memmlp.training.losses import FixedWeights, Loss, Terms, TermsLoss
 from memmlp.training.losses.terms import Comparison, measure_jerk
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import Training, make_validation, read_kept_errors
+from memmlp.training.train_network import (
+    Training,
+    TrainingJob,
+    make_validation,
+    read_kept_errors,
+    write_weights,
+)
 
 STREAMS_TOGETHER = 64  # pieces that the network streams through side by side
 
@@ -90,22 +91,15 @@ class RefinerTraining(Training):
     mirror: bool = False
     metrics: UserMetrics = field(default_factory=dict)
 
-    def train(
-        self,
-        architecture: Architecture,
-        data: PreparedMotion,
-        prerequisite: Path | None,
-        run: Run,
-        device: torch.device,
-        on_validation: ValidationCallback | None = None,
-    ) -> dict[str, float]:
-        assert prerequisite is not None
-        plain = data.open("train").to(device)
+    def train(self, job: TrainingJob) -> dict[str, float]:
+        assert job.prerequisite is not None
+        plain = job.data.open("train").to(job.device)
         dataset = MirroredDataset(plain) if self.mirror else plain
-        finished = replace(architecture, refiner=None).load(prerequisite).to(device).requires_grad_(False)
+        finished = replace(job.architecture, refiner=None).load(job.prerequisite)
+        finished = finished.to(job.device).requires_grad_(False)
         torch.manual_seed(self.seed)
-        model = self.refiner.build(finished).to(device)
-        validate = make_validation(data, self.metrics, device, self.optim.validation_pieces)
+        model = self.refiner.build(finished).to(job.device)
+        validate = make_validation(job.data, self.metrics, job.device, self.optim.validation_pieces)
         task = RefinerTask(
             model,
             LOSSES[self.refiner.velocities](),
@@ -114,10 +108,10 @@ class RefinerTraining(Training):
             self.optim,
             validate=lambda: validate(model.eval()),
         )
-        train(task, self.optim, run, self.seed, "refiner", on_validation)
+        train(task, self.optim, job.run, self.seed, "refiner", job.on_validation)
         finished.requires_grad_(True)
-        checkpoint.write(run.model, checkpoint.collect_module_tensors("model", model), {})
-        return read_kept_errors(run)
+        write_weights(job.run, model)
+        return read_kept_errors(job.run)
 
     def draw_pieces(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
         """Draw the pieces: frames (P, n, 252), and the clip index of each piece (P,)."""

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -23,17 +22,14 @@ from memmlp.common.components import component
 from memmlp.common.settings import Settings, at_least, each, fraction, group, positive, setting, sized
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
-from memmlp.motion.motion_source import PreparedMotion
 from memmlp.motion.normalizer import use_float32
 from memmlp.networks import checkpoint
-from memmlp.networks.architectures import Architecture
 from memmlp.networks.sage_net import SAGENet
 from memmlp.networks.sage_parts import HIDDEN, LOWER, UPPER, HalfVQVAE
-from memmlp.runs.run import Run
-from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
+from memmlp.training.loop import StepResult, TrainingTask, train
 from memmlp.training.losses.terms import BodyMotion
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import NetworkTraining, Training, read_kept_errors
+from memmlp.training.train_network import NetworkTraining, Training, TrainingJob, read_kept_errors
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
 """SAGE-Net's parts in training order; each part uses the parts before it."""
@@ -154,19 +150,12 @@ class SAGEPartTraining(Training):
     def description(self) -> str:
         return f"{self.kind.replace('_', ' ')}: training for {self.network.optim.steps} steps"
 
-    def train(
-        self,
-        architecture: Architecture,
-        data: PreparedMotion,
-        prerequisite: Path | None,
-        run: Run,
-        device: torch.device,
-        on_validation: ValidationCallback | None = None,
-    ) -> dict[str, float]:
-        before = checkpoint.read(prerequisite)[0] if prerequisite else {}
+    def train(self, job: TrainingJob) -> dict[str, float]:
+        run, data, device = job.run, job.data, job.device
+        before = checkpoint.read(job.prerequisite)[0] if job.prerequisite else {}
         dataset = data.open("train").to(device)
         torch.manual_seed(self.network.seed)
-        net = architecture.build(architecture.make_normalizer(data.manifest, dataset.frames), None)
+        net = job.architecture.build(job.architecture.make_normalizer(data.manifest, dataset.frames), None)
         assert isinstance(net, SAGENet)
         parts: dict[str, nn.Module] = {
             "codes.upper": net.make_codes(UPPER),
@@ -183,7 +172,8 @@ class SAGEPartTraining(Training):
         task = SAGEPartTask(
             part.requires_grad_(True), objective, self.network, dataset, validation, net.frames
         )
-        train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "), on_validation)
+        label = self.kind.replace("_", " ")
+        train(task, self.network.optim, run, self.network.seed, label, job.on_validation)
         if distributed.is_first():
             checkpoint.write(run.model, before | checkpoint.collect_module_tensors(name, part), {})
         return read_kept_errors(run)
@@ -193,17 +183,9 @@ class SAGEPartTraining(Training):
 class SAGEDecoderTraining(SAGEPartTraining):
     """The training of SAGE-Net's decoder on predictions of the trained diffusion models."""
 
-    def train(
-        self,
-        architecture: Architecture,
-        data: PreparedMotion,
-        prerequisite: Path | None,
-        run: Run,
-        device: torch.device,
-        on_validation: ValidationCallback | None = None,
-    ) -> dict[str, float]:
-        fixed = replace(architecture, trained_parts=("upper", "lower"))
-        return self.network.train(fixed, data, prerequisite, run, device, on_validation)
+    def train(self, job: TrainingJob) -> dict[str, float]:
+        fixed = replace(job.architecture, trained_parts=("upper", "lower"))
+        return self.network.train(replace(job, architecture=fixed))
 
 
 class SAGEPartTask(TrainingTask):

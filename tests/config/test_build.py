@@ -24,6 +24,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.runs.run import Run
 from memmlp.training.run_stages import Experiment, make_prerequisites
+from memmlp.training.train_network import TrainingJob
 
 TINY = [
     "profile=tiny", "data.synth.minutes=0.1", "loggers=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
@@ -69,7 +70,7 @@ def trained(*overrides: str) -> Arm:
     above = make_prerequisites(experiment, data)
     run = Run(Path(mkdtemp(dir=".", prefix="arm-")))
     weights = above.model if above else None
-    experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
+    experiment.training.train(TrainingJob(experiment.architecture, data, weights, run, experiment.device))
     model = experiment.architecture.load(run.model)
     test = data.open("test")
     short = MotionDataset(test.frames[:12], torch.tensor([0]), torch.tensor([12]), test.names[:1])

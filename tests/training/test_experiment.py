@@ -21,6 +21,7 @@ from memmlp.runs.identity import NEUTRAL
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
 from memmlp.training.run_stages import Experiment, make_prerequisites
+from memmlp.training.train_network import TrainingJob
 
 BASE = [
     "profile=tiny", "data=mocap", "data.root=clips", "data.split.groups=[]", "memory.shift=frame",
@@ -128,7 +129,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     codes = make_prerequisites(replace(experiment, loggers=Loggers((), folder)), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
-    experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
+    experiment.training.train(TrainingJob(experiment.architecture, data, codes, run, experiment.device))
     model = experiment.architecture.load(run.model)
     found = data.open("test")
     ends = torch.tensor([0]), torch.tensor([11])

@@ -34,6 +34,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled
 from memmlp.training import run_stages
 from memmlp.training.run_stages import make_prerequisites, record_outcome
+from memmlp.training.train_network import TrainingJob
 
 
 def motion_run(folder: Path) -> Run:
@@ -177,7 +178,7 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
     run = Run(home / "variants" / name)
     run.folder.mkdir(parents=True, exist_ok=True)
     weights = above.model if above else None
-    experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
+    experiment.training.train(TrainingJob(experiment.architecture, data, weights, run, experiment.device))
     model = experiment.architecture.load(run.model)
     values = run.metrics()[-1].values
     assert all(np.isfinite(value) for value in values.values())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -152,16 +151,11 @@ def _sort_runs(listed: Sequence[Run], records: Mapping[str, Record], sort: str) 
     key, reverse = sort.removeprefix("-"), sort.startswith("-")
     check_key(key, records.values(), "--sort")
     values: dict[str, Any] = {run.id: records[run.id].get(key) for run in listed}
-    with_value = [
-        run for run in listed if values[run.id] not in (None, "", ()) and not _is_nan(values[run.id])
-    ]
+    with_value = [run for run in listed if values[run.id] not in (None, "", ())]
+    with_value = [run for run in with_value if values[run.id] == values[run.id]]  # NaN differs from itself
     numbers = all(isinstance(values[run.id], int | float) for run in with_value)
     with_value.sort(key=lambda run: values[run.id] if numbers else str(values[run.id]), reverse=reverse)
     return [*with_value, *(run for run in listed if run not in with_value)]
-
-
-def _is_nan(value: object) -> bool:
-    return isinstance(value, float) and math.isnan(value)
 
 
 def _choose_keys(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:

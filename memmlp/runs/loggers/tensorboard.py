@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
@@ -77,31 +76,19 @@ class ShownInTensorBoard:
             )
         self.writer.flush()
 
-    def write_texts(self, texts: Mapping[str, str]) -> None:
-        """Write texts; they may contain Markdown."""
-        for key, text in texts.items():
-            self.writer.add_text(key, text)
-
     def end(self, facts: RunFacts) -> None:
         """Write the results; write status, tags, note and config as text."""
-        config = _format_table("key", "value", facts.config)
-        self.write_texts({**facts.texts, "tags": ", ".join(facts.tags), "note": facts.note, "config": config})
+        pairs = [("key", "value"), ("---", "---"), *facts.config.items()]
+        config = "\n".join(f"| {escape_markdown(key)} | {escape_markdown(value)} |" for key, value in pairs)
+        texts = {**facts.texts, "tags": ", ".join(facts.tags), "note": facts.note, "config": config}
+        for key, text in texts.items():
+            self.writer.add_text(key, text)
         self.log(facts.results)
         (self.folder / FINGERPRINT).write_text(facts.fingerprint)
 
     def close(self) -> None:
         """Close the file."""
         self.writer.close()
-
-
-def _format_table(key: str, value: str, rows: Mapping[str, Any]) -> str:
-    return "\n".join(
-        [
-            f"| {key} | {value} |",
-            "|---|---|",
-            *(f"| {escape_markdown(k)} | {escape_markdown(str(v))} |" for k, v in rows.items()),
-        ]
-    )
 
 
 def _make_folder_name(name: str, run_id: str = "") -> str:
