@@ -115,9 +115,8 @@ def export(
         from memmlp.config.open_run import open_run
 
         opened = open_run(outputs, run)
-        line = (
-            write_exact(opened, out, form) if precision == "fp32" else write_lower(opened, out, form, limit)
-        )
+        exact = precision == "fp32"
+        line = write_exact(opened, out, form) if exact else write_lower(opened, out, form, limit)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {line}")
 
 
@@ -129,10 +128,7 @@ def copy_deployed(run: Run, out: Path, form: ExportForm, max_growth: float) -> s
     for folder in sorted(run.deployments.glob("*")):
         deployed = run.deployment(folder.name)
         record, settings, path = deployed.record, deployed.settings, deployed.onnx_path(form.precision)
-        graphs = (
-            settings.get("graph", "auto"),
-            record.get("graph"),
-        )  # the requested graph, and the exported graph
+        graphs = settings.get("graph", "auto"), record.get("graph")  # the requested one, and the exported one
         if form.full or form.graph not in graphs or form.opset != settings.get("opset", 18):
             continue
         if not (deployed.done and deployed.is_current) or path.name not in record["artifacts"]:
@@ -194,12 +190,10 @@ def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
         write_graph(network, path, opened.run.id, form)
-        space = form.full and form.full[0]
-        apart = (
-            measure_full_differences(model, path, clip, space)
-            if space
-            else measure_differences(model, path, clip)
-        )
+        if form.full:
+            apart = measure_full_differences(model, path, clip, form.full[0])
+        else:
+            apart = measure_differences(model, path, clip)
         line = f"differs from torch by at most {float(apart.max()):.1e} on a test clip"
         if not is_rounding(apart):
             raise click.ClickException(

@@ -253,12 +253,10 @@ def serve(options: LiveOptions) -> None:
         run = None if options.is_onnx_file else find_run(options.outputs, options.network)
         remark = warn_if_hardly_trained(count_training_frames(run)) if run else ""
         hub = page.Hub(make_greeting(source, name, outputs, remark, avatar is not None))
-        fitting = (
-            Fitting(stream, source.space, options.calibration, hub.publish_state)
-            if source.has_wearer
-            else None
-        )
-        ask = fitting.submit_command if fitting else None
+        fitting, ask = None, None
+        if source.has_wearer:
+            fitting = Fitting(stream, source.space, options.calibration, hub.publish_state)
+            ask = fitting.submit_command
         with (
             finish_uninterrupted(outputs.close),
             page.LiveServer(hub, options.port, options.host, options.token, files, ask) as server,

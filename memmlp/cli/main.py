@@ -151,11 +151,8 @@ def _choose_exit_code(error: Exception) -> int | None:
 
 def _format_error(error: Exception, arguments: Sequence[str]) -> str:
     if isinstance(error, click.Abort):
-        command = COMMANDS.get(arguments[0]) if arguments else None
-        resumed = (
-            "; repeat the command to continue from the last checkpoint" if command and command.resumes else ""
-        )
-        return f"interrupted{resumed}"
+        resumes = bool(arguments) and arguments[0] in COMMANDS and COMMANDS[arguments[0]].resumes
+        return "interrupted" + "; repeat the command to continue from the last checkpoint" * resumes
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "memmlp"
         return f"{error.format_message()} (see {path} --help)"

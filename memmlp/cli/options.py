@@ -75,9 +75,7 @@ class TargetAddress(click.ParamType):
         if isinstance(value, tuple):
             return value
         host, colon, port = value.rpartition(":")
-        if (
-            not colon or value.endswith("]") or ("]" not in value and ":" in host)
-        ):  # a name, or an IPv6 address
+        if not colon or value.endswith("]") or ("]" not in value and ":" in host):  # a name, or IPv6
             return value.strip("[]"), None
         return host.strip("[]"), PORT.convert(port, param, ctx)
 

@@ -113,9 +113,8 @@ def _predict_piece(
 
     first_run = next(iter(runs.values()))
     title = clip or first_run.test.names[0]
-    first, last = find_frame_range(
-        len(find_clip(first_run.test, title)), title, begin, end, ("--from", "--to")
-    )
+    length = len(find_clip(first_run.test, title))
+    first, last = find_frame_range(length, title, begin, end, ("--from", "--to"))
     truths, predictions = [], {}
     for label, run in runs.items():
         announce(f"render: {label} on {title}")

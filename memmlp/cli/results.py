@@ -72,10 +72,8 @@ def save_command(
 
     sweep = find_sweep(name, overrides)
     shown = load_shown_sweep(sweep, overrides, outputs.absolute())
-    runs, flags = (
-        find_finished_runs(shown.sweep, make_run_finder(shown.plan, functools.cache(load_measured_run))),
-        shown.flags,
-    )
+    finder, flags = make_run_finder(shown.plan, functools.cache(load_measured_run)), shown.flags
+    runs = find_finished_runs(shown.sweep, finder)
     if untrained:
         from memmlp.config.untrained_costs import measure_untrained_variants
 
@@ -150,10 +148,8 @@ def docs(folder: Path, check: bool) -> None:
     stale = sorted(name for name in old if present[name].startswith(MARK) or name.startswith(f"{FILES}/"))
     if check:
         for name in [*differing, *stale]:
-            click.echo(
-                f"{folder / name}: differs from the kept results; update it with: memmlp results docs",
-                err=True,
-            )
+            update = "differs from the kept results; update it with: memmlp results docs"
+            click.echo(f"{folder / name}: {update}", err=True)
         if differing or stale:
             raise SystemExit(1)
     else:
@@ -216,11 +212,9 @@ def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence
         flags = [*restricted, *([other] if other else [])]
         table = make_table(sweep, runs, command=kept.command)
     changed = sorted({change for run in kept.all_runs for change in list_outdated(run.origin.every_version)})
-    flags += [
-        *kept.flags,
-        *([f"made with earlier component versions: {', '.join(changed)}"] if changed else []),
-    ]
-    return replace(table, flags=(*table.flags, *flags))
+    if changed:
+        flags.append(f"made with earlier component versions: {', '.join(changed)}")
+    return replace(table, flags=(*table.flags, *kept.flags, *flags))
 
 
 @results.command("searches")

@@ -75,14 +75,8 @@ class SearchSetup(NamedTuple):
     def list_overrides(self, values: Mapping[str, Value]) -> list[str]:
         """Return a trial's overrides: those of the search file and the command line, then the trial's values.
         By default, trials are neither exported nor timed, and only evaluated on validation clips."""
-        fixed = self.search.budget
-        return [
-            "export.graph=off",
-            *fixed,
-            *self.search.base,
-            *self.command_line,
-            *self.search.overrides(values),
-        ]
+        fixed = ["export.graph=off", *self.search.budget, *self.search.base]
+        return [*fixed, *self.command_line, *self.search.overrides(values)]
 
     @property
     def config_options(self) -> list[str]:
@@ -172,9 +166,7 @@ def _check_space(setup: SearchSetup) -> str:
     first = _make_tasks(setup, next(iter(setup.search.list_first_trials()), {}))[0][-1]
     validated = [first.config["optim"][key] for key in ("validate_every", "validation_pieces")]
     often = f"validated every {validated[0]} steps on {validated[1]} pieces"  # trials can be pruned then
-    trained = digest(
-        [one.identity("").id for one in requests]
-    )  # the first trial may lack components of the limits
+    trained = digest([one.identity("").id for one in requests])  # also of components at the limits
     return f"{first.id}, {often}, used with {select_inference_config(first.config)}, trained with {trained}"
 
 

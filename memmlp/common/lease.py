@@ -77,9 +77,8 @@ def is_alive(process: Mapping[str, Any]) -> bool | None:
         return False
     except PermissionError:  # the process belongs to another user
         pass
-    return _read_process_fields(pid)[:1] not in [[state] for state in ENDED] and _read_start_time(
-        pid
-    ) == process.get("born")
+    ended = _read_process_fields(pid)[:1] in [[state] for state in ENDED]
+    return not ended and _read_start_time(pid) == process.get("born")
 
 
 def _read_start_time(pid: int) -> str | None:
@@ -219,11 +218,10 @@ class Lock:
     def _read_last_claim(self) -> Claim | None:
         while claims := self.list_claims():
             (number, owned), path = claims[-1]
+            # A claim may have been superseded meanwhile. On NFS, opening a file refreshes it from the server.
             with (
-                contextlib.suppress(FileNotFoundError),  # it has been superseded meanwhile
-                open(
-                    path, encoding="utf-8", errors="replace"
-                ) as file,  # on NFS, opening a file refreshes it from the server
+                contextlib.suppress(FileNotFoundError),
+                open(path, encoding="utf-8", errors="replace") as file,
             ):
                 return Claim(number, not owned, file.read(MAX_CLAIM), os.fstat(file.fileno()).st_mtime_ns)
         return None

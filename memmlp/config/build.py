@@ -292,9 +292,7 @@ def _apply_override(cfg: DictConfig, word: str) -> None:
     if not equals:
         raise InputError(f"{word}: must be KEY=VALUE")
     try:
-        override = OverridesParser.create().parse_override(
-            word
-        )  # Hydra's grammar, unlike YAML, reads off as text
+        override = OverridesParser.create().parse_override(word)  # unlike YAML, Hydra reads off as text
         if override.is_sweep_override():
             raise InputError(f"{word}: must be a single value, or a list in brackets: [A,B]")
         OmegaConf.update(cfg, key, override.value(), merge=True)
@@ -335,19 +333,16 @@ def _list_differences(config: Mapping[str, Any]) -> Iterator[str]:
     named = [slot for slot in SLOTS if slot in config and (config[slot] is None or "name" in config[slot])]
     options = {slot: find_option(config, slot) for slot in named}
     custom = [slot for slot, option in options.items() if option and not _is_shipped(slot, option)]
-    for slots in (
-        ["model"],
-        [slot for slot in options if slot != "model"],
-    ):  # a model may set options of other slots
+    for is_model in (True, False):  # a model may set options of other slots
         default = _compose_default(tuple(chosen))
-        changed = [slot for slot in slots if slot in options and options[slot] != find_option(default, slot)]
+        slots = [slot for slot in options if (slot == "model") == is_model]
+        changed = [slot for slot in slots if options[slot] != find_option(default, slot)]
         yield from (f"{slot}={options[slot] or 'none'}" for slot in changed)
         chosen += [f"{slot}={options[slot] or 'null'}" for slot in changed if slot not in custom]
     default = _compose_default(tuple(chosen))
     own, usual = flatten(config), {"data.drawn_by": "frames", "data.mirror": False} | flatten(default)
-    for key in select_training_config(config) | select_training_config(
-        default
-    ):  # a key may count in only one of the configs
+    counting = select_training_config(config) | select_training_config(default)  # a key may count in one only
+    for key in counting:
         group, _, last = key.partition(".")
         if group in (*custom, "profile") or last == "name" or key in ("seed", "vqvae.seed"):
             continue

@@ -158,13 +158,10 @@ def _explain_type_error(error: OmegaConfBaseException, override: str | None) -> 
     schema = error.object_type
     if not dataclasses.is_dataclass(schema) and ("SourceConfig" in str(error) or name.startswith(SOURCES)):
         return f"{SOURCES}: must be set in a custom config file (docs/guides/checks.md)"
-    if isinstance(error, ConfigAttributeError | ConfigKeyError) and not isinstance(
-        error, InterpolationKeyError
-    ):
-        keys = (
-            [field.name for field in dataclasses.fields(schema)] if dataclasses.is_dataclass(schema) else []
-        )
-        return describe_unknown_key(name, keys)
+    no_key = isinstance(error, ConfigAttributeError | ConfigKeyError)
+    if no_key and not isinstance(error, InterpolationKeyError):
+        fields = dataclasses.fields(schema) if dataclasses.is_dataclass(schema) else ()
+        return describe_unknown_key(name, [field.name for field in fields])
     if isinstance(error, ValidationError):
         shown = override if override and override.lstrip("+").startswith(f"{name}=") else name
         return f"{shown}: expected {_describe_expected(name, schema, error)}"

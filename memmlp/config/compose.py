@@ -185,9 +185,7 @@ def _compose_job(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
         special = special or one.is_sweep_override() or one.is_hydra_override()
     if special:
         return compose(args.config_name or CONFIG, overrides)
-    cfg = cast(
-        DictConfig, pickle.loads(_compose_options(*(str(override.input_line) for override in options)))
-    )
+    cfg: DictConfig = pickle.loads(_compose_options(*(str(override.input_line) for override in options)))
     for override in values:
         try:
             OmegaConf.update(cfg, override.key_or_group, override.value(), merge=True)
@@ -283,10 +281,8 @@ def _check_texts(cfg: DictConfig, overrides: Sequence[str]) -> None:
             continue
         typed = Override.parse(str(parsed.input_line))
         parts = re.split(r"[\[\],\s]+", typed.value or "")
-        items = (
-            value.list if isinstance(value, ChoiceSweep) else value if isinstance(value, list) else [value]
-        )
-        for item in items:
+        items = value.list if isinstance(value, ChoiceSweep) else value
+        for item in items if isinstance(items, list) else [items]:
             if isinstance(item, int | float) and str(item) not in parts:
                 quoted = join_command([make_override(typed.key, typed.value or "")])
                 raise InputError(f"{typed}: would become {item}; quote the value: {quoted}")

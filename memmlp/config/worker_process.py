@@ -22,10 +22,8 @@ def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | No
 
         if line := devices.describe_missing_gpu():
             return line
-    should_continue = (
-        partial(Presence.is_alive, Path(controller)) if controller else partial(has_controller, Path(path))
-    )
-    work_on_plan(Path(path), partial(perform_task, Path(path), threads), should_continue)
+    alive, file = (Presence.is_alive, controller) if controller else (has_controller, path)
+    work_on_plan(Path(path), partial(perform_task, Path(path), threads), partial(alive, Path(file)))
     return None
 
 

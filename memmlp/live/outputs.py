@@ -29,6 +29,7 @@ import errno
 import socket
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -74,6 +75,18 @@ class Output(Protocol):
         """Finish pending work, such as writing files."""
 
 
+def _run_all(actions: Iterable[Callable[[], None]]) -> None:
+    """Run every action, then raise the first error."""
+    errors = []
+    for action in actions:
+        try:
+            action()
+        except Exception as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
+
+
 class Outputs:
     """Several outputs. A failing output is reported once, and the next frame is tried again."""
 
@@ -93,14 +106,7 @@ class Outputs:
 
     def close(self) -> None:
         """Close all outputs, then raise the first error."""
-        errors = []
-        for output in self.outputs:
-            try:
-                output.close()
-            except Exception as error:
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        _run_all(output.close for output in self.outputs)
 
 
 def encode_osc(messages: Iterable[tuple[str, str, Iterable[Any]]]) -> bytes:
@@ -160,9 +166,7 @@ class VMC:
     def take(self, frame: BodyFrame) -> None:
         """Send the frame's bones, in two datagrams."""
         self.start = frame.time if self.start is None else self.start
-        values = np.empty(
-            (N_JOINTS, 7)
-        )  # position (metres) and quaternion of each bone in the parent's frame
+        values = np.empty((N_JOINTS, 7))  # position (metres) and quaternion of each bone, parent's frame
         values[:, :3] = (frame.rest - frame.rest[list(PARENTS)]) * SPACE.body
         values[ROOT, :3] = SPACE.convert_positions_from_amass(frame.positions[ROOT])
         values[:, 3:] = matrix_to_quaternion(SPACE.convert_pose_from_amass(frame.local))
@@ -188,9 +192,7 @@ class VRChat:
         """Send the frame's trackers, in one datagram."""
         parts = [f"/tracking/trackers/{name}/{part}" for name in NAMES for part in ("position", "rotation")]
         vectors = place_trackers(frame).reshape(-1, 3).tolist()
-        self.receiver.send(
-            encode_osc((part, "fff", vector) for part, vector in zip(parts, vectors, strict=True))
-        )
+        self.receiver.send(encode_osc(zip(parts, ["fff"] * len(parts), vectors, strict=True)))
 
 
 def place_trackers(frame: BodyFrame) -> np.ndarray:
@@ -199,10 +201,8 @@ def place_trackers(frame: BodyFrame) -> np.ndarray:
     turned = np.array(frame.local, np.float64)
     for joint in range(1, N_JOINTS):
         turned[joint] = turned[PARENTS[joint]] @ turned[joint]
-    positions = SPACE.convert_positions_from_amass(frame.positions[AT])
-    return np.stack(
-        [positions, compute_euler_angles(SPACE.convert_rotations_from_amass(turned[TURNS_WITH]))], 1
-    )
+    angles = compute_euler_angles(SPACE.convert_rotations_from_amass(turned[TURNS_WITH]))
+    return np.stack([SPACE.convert_positions_from_amass(frame.positions[AT]), angles], 1)
 
 
 def compute_euler_angles(rotations: np.ndarray) -> np.ndarray:
@@ -260,14 +260,7 @@ class Recorder:
         if not self.rows:
             self.report("recording: no frame was received, so no file is written")
             return
-        errors, rows = [], np.stack(self.rows)
-        for path in self.paths:
-            try:
-                self._write(path, rows)
-            except InputError as error:
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        _run_all(partial(self._write, path, np.stack(self.rows)) for path in self.paths)
 
     def _write(self, path: Path, rows: np.ndarray) -> None:
         """Write a file, and report its length, breaks and interpolated frames."""

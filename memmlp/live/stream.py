@@ -314,10 +314,8 @@ class Stream:
         from memmlp.motion.normalizer import Normalizer
 
         world = Normalizer.from_coordinates(World(), torch.tensor(self.network.body.rest))
-        motion = torch.from_numpy(
-            np.concatenate([sixd.reshape(1, -1), self.network.position.reshape(1, -1)], 1)
-        )
-        solved = self.ik.solve(world, motion, torch.from_numpy(self._sparse[None]))
+        motion = np.concatenate([sixd.reshape(1, -1), self.network.position.reshape(1, -1)], 1)
+        solved = self.ik.solve(world, *map(torch.from_numpy, (motion, self._sparse[None])))
         return np.asarray(solved).reshape(-1, 6)
 
     def calibrate(self, head: TrackerPose, left: TrackerPose, right: TrackerPose) -> Offsets:

@@ -187,29 +187,20 @@ def measure_full_differences(model: MotionModel, path: Path, clip: Tensor, space
     uses its own history. torch computes the same as evaluation: features, network and
     `Normalizer.compute_positions`. If a quaternion does not have length 1, all differences are infinity."""
     positions, rotations = extract_trackers(clip[:, :SPARSE_DIM].cpu())
-    sparse, reference, stream = (
-        compute_sparse_features(rotations, positions),
-        find_space(space),
-        OnnxStream(path),
-    )
+    sparse, reference = compute_sparse_features(rotations, positions), find_space(space)
+    stream = OnnxStream(path)
     motion = stream_torch(model.cpu().eval(), sparse)
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
-    joints = [
-        model.normalizer.compute_positions(motion, sparse),
-        motion[:, POSITION].unflatten(-1, (N_JOINTS, 3)),
-    ]
-    expected = [
-        reference.convert_pose_from_amass(local),
-        *(reference.convert_positions_from_amass(part.numpy()) for part in joints),
-    ]
+    predicted = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+    joints = (model.normalizer.compute_positions(motion, sparse), predicted)
+    expected = [reference.convert_positions_from_amass(part.numpy()) for part in joints]
+    expected.insert(0, reference.convert_pose_from_amass(local))
     inputs = (
         reference.convert_positions_from_amass(positions.numpy()),
         reference.convert_rotations_from_amass(rotations.numpy()),
     )
     steps = [stream.step(*(part[index : index + 1] for part in inputs)) for index in range(len(clip) + 1)]
-    outputs = [
-        np.concatenate(parts)[1:] for parts in zip(*steps, strict=True)
-    ]  # drop the step before the first frame
+    outputs = [np.concatenate(parts)[1:] for parts in zip(*steps, strict=True)]  # without the step before
     if outputs[0].shape[-1] == 4:
         if not np.abs(np.linalg.norm(outputs[0], axis=-1) - 1).max() <= UNIT:
             return torch.full((len(clip),), torch.inf)

@@ -94,17 +94,13 @@ class Offsets(NamedTuple):
 
 def check_offsets(offsets: Offsets) -> Offsets:
     """Return the offsets as float64 arrays. Raises InputError if they are malformed."""
+    expected = "must be memmlp.Offsets with positions (3, 3) and rotations (3, 3, 3)"
     try:
         positions, rotations = (np.asarray(part, np.float64) for part in offsets)
     except (TypeError, ValueError):
-        raise InputError(
-            "offsets: must be memmlp.Offsets with positions (3, 3) and rotations (3, 3, 3)"
-        ) from None
+        raise InputError(f"offsets: {expected}") from None
     if positions.shape != (3, 3) or rotations.shape != (3, 3, 3):
-        shapes = f"{positions.shape} and {rotations.shape}"
-        raise InputError(
-            f"offsets: must be positions (3, 3) and rotations (3, 3, 3); the shapes are {shapes}"
-        )
+        raise InputError(f"offsets: {expected}; the shapes are {positions.shape} and {rotations.shape}")
     if not (np.isfinite(positions).all() and np.isfinite(rotations).all()):
         raise InputError("offsets: must not contain NaN or infinity")
     check_rotations([f"offsets of {name}" for name in ("head", "left", "right")], rotations)

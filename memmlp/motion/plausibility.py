@@ -90,10 +90,8 @@ def find_faults(clip: Clip) -> Iterator[str]:
         yield f"{where}, so trans may not be in metres with Z up, or may lack the heights"
     forward = np.cross(joints[:, HIPS[0]] - joints[:, HIPS[1]], joints[:, SPINE] - joints[:, 0])
     feet = joints[:, TOES].mean(1) - joints[:, ANKLES].mean(1)
-    if (
-        np.median((feet * forward).sum(-1) / np.linalg.norm(feet, axis=-1) / np.linalg.norm(forward, axis=-1))
-        < -BACKWARD_FEET
-    ):
+    lengths = np.linalg.norm(feet, axis=-1) * np.linalg.norm(forward, axis=-1)
+    if np.median((feet * forward).sum(-1) / lengths) < -BACKWARD_FEET:
         yield "the feet point backward relative to the pelvis, so left and right legs may be swapped"
     yield from _find_jumps(clip)
     checked = np.arange(len(clip))[:: max(1, round(clip.fps / FPS))][:MOST_FRAMES]

@@ -29,13 +29,8 @@ MAX_FILES = 1000
 MAX_SIZE = 4 * 10**9  # default limit for the total size of all files, bytes
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 PART = r"\w[\w.-]{0,99}"  # a folder or file name; not ".."
-ALLOWED = re.compile(
-    "|".join(
-        re.escape(pattern).replace(r"\*", PART)
-        for pattern in (*Run.FILES, "notes.json", "DONE")
-        if pattern != "FAILED"
-    )
-)
+PATTERNS = {*Run.FILES, "notes.json", "DONE"} - {"FAILED"}
+ALLOWED = re.compile("|".join(re.escape(pattern).replace(r"\*", PART) for pattern in sorted(PATTERNS)))
 """The files that an archive may contain."""
 
 

@@ -99,9 +99,7 @@ def compute_code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
 def read_code_files(packages: Iterable[str] = ()) -> dict[str, bytes]:
     """Return the content of each file that affects the numbers of a run, as this process runs it."""
     users = _read_user_files(packages).items()
-    return _read_package_code() | {
-        f"{name}:{file}": code for name, files in users for file, code in files.items()
-    }
+    return _read_package_code() | {f"{name}:{file}": files[file] for name, files in users for file in files}
 
 
 def describe_sources(packages: Iterable[str] = ()) -> dict[str, dict[str, str]]:
@@ -165,22 +163,18 @@ def compute_code_digest(code: bytes) -> str:
 
 def _read_user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
     """Return the content of all Python files in users' packages, by package and file; empty if not found."""
-    return {
-        name: {file: _read_user_code(path) for file, path in _list_package_files(name).items()}
-        for name in packages
-    }
+    listed = {name: _list_package_files(name).items() for name in packages}
+    return {name: {file: _read_user_code(path) for file, path in files} for name, files in listed.items()}
 
 
 def describe_user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
     """Return the version and code digest of each user's package, by name."""
-    digests = {
-        name: {file: compute_code_digest(code) for file, code in files.items()}
-        for name, files in _read_user_files(names).items()
-    }
-    return {
-        name: {"version": _find_user_version(name), "digest": compute_byte_digest(repr(files).encode())}
-        for name, files in digests.items()
-    }
+    found: dict[str, dict[str, str | None]] = {}
+    for name, files in _read_user_files(names).items():
+        digests = {file: compute_code_digest(code) for file, code in files.items()}
+        digest = compute_byte_digest(repr(digests).encode())
+        found[name] = {"version": _find_user_version(name), "digest": digest}
+    return found
 
 
 def _find_user_version(name: str) -> str | None:
@@ -268,17 +262,15 @@ def merge_run_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> di
     runs come first, then earlier versions of prerequisite runs that were trained again."""
     merged = dict(after)
     for key in MACHINE:
-        earlier_values = [before[key]] if key in before and before[key] != after.get(key) else []
-        values = [*earlier_values, after.get(key)]
-        merged[key] = ", ".join(map(str, values)) if earlier_values else after.get(key)
+        now = after.get(key)
+        merged[key] = f"{before[key]}, {now}" if key in before and before[key] != now else now
     old, new = before.get("git"), after.get("git")
     if old and new:
         other = old.get("before") or (old["commit"] if old["commit"] != new["commit"] else None)
         merged["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
     sources = before.get("sources", after["sources"])
-    merged["sources"] = after["sources"] | dict.fromkeys(
-        list_differing_files(sources, after["sources"]), MIXED
-    )
+    mixed = list_differing_files(sources, after["sources"])
+    merged["sources"] = after["sources"] | dict.fromkeys(mixed, MIXED)
     prerequisite = after.get(PREREQUISITES, [])
     if earlier := [one for one in before.get(PREREQUISITES, []) if one not in prerequisite]:
         merged[PREREQUISITES] = [*prerequisite, *earlier]

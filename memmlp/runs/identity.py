@@ -154,10 +154,12 @@ def compute_evaluation_id(config: Mapping[str, Any], mode: str, groups_digest: s
 def hash_evaluation_settings(settings: Mapping[str, Any]) -> str:
     """Return the id of an evaluation with these settings and the current component versions."""
     mode, ik = settings["mode"], settings["ik"]
-    name = mode if ik == "off" else f"{mode}-{ik}"
-    return (
-        f"{name}-{_digest({'settings': settings, 'component_versions': find_evaluation_versions(settings)})}"
-    )
+    versions = find_evaluation_versions(settings)
+    return _hash_settings(mode if ik == "off" else f"{mode}-{ik}", settings, versions)
+
+
+def _hash_settings(name: str, settings: Mapping[str, Any], versions: Mapping[str, int]) -> str:
+    return f"{name}-{_digest({'settings': settings, 'component_versions': versions})}"
 
 
 def find_evaluation_versions(settings: Mapping[str, Any]) -> dict[str, int]:
@@ -182,17 +184,13 @@ def select_evaluation_settings(
         "source_groups": {name: own for name, source in sources if (own := source.get("groups"))},
         "groups_file": groups_digest,
     }
-    drawn = (
-        {"batch": chosen.get("batch")}
-        if select_inference_config(config).get("memory.blend") == "sampled"
-        else {}
-    )
-    custom = {
-        name: collect_components().get(("metric", name)) for name in sorted(chosen.get("metrics") or ())
-    }
+    inference = select_inference_config(config)
+    drawn = {"batch": chosen.get("batch")} if inference.get("memory.blend") == "sampled" else {}
+    names = sorted(chosen.get("metrics") or ())
+    custom = {name: collect_components().get(("metric", name)) for name in names}
     metrics = {name: f"{one.module}.{one.builds}" if one else "" for name, one in custom.items()}
     further = {key: value for key, value in {**groups, "metrics": metrics}.items() if value}
-    return {"mode": mode, **solver, **select_inference_config(config), **drawn, **further}
+    return {"mode": mode, **solver, **inference, **drawn, **further}
 
 
 def get_solver_name(settings: Mapping[str, Any]) -> str | None:
@@ -211,10 +209,7 @@ def compute_deployment_id(config: Mapping[str, Any]) -> str:
 
 def hash_deployment_settings(settings: Mapping[str, Any]) -> str:
     """Return the id of a deployment with these settings and the current component versions."""
-    name = settings.get("precision", "fp32")
-    return (
-        f"{name}-{_digest({'settings': settings, 'component_versions': find_deployment_versions(settings)})}"
-    )
+    return _hash_settings(settings.get("precision", "fp32"), settings, find_deployment_versions(settings))
 
 
 def find_deployment_versions(settings: Mapping[str, Any]) -> dict[str, int]:

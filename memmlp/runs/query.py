@@ -60,9 +60,8 @@ def label_data(records: Sequence[Record]) -> list[str]:
     """Return a label for each record's data: its name, with a short digest if the name is ambiguous. The
     record of a VQ-VAE does not name its data; it gets the name from another record with the same data."""
     digests = [str(one.get("data_digest") or "") for one in records]
-    named = {
-        digest: one["data.name"] for digest, one in zip(digests, records, strict=True) if "data.name" in one
-    }
+    pairs = zip(digests, records, strict=True)
+    named = {digest: one["data.name"] for digest, one in pairs if "data.name" in one}
     names = [named.get(digest) for digest in digests]
     ambiguous = {name for name in names if len({d for d, own in named.items() if own == name}) > 1}
     return [
@@ -77,13 +76,9 @@ def list_differing_keys(configs: Sequence[Mapping[str, Any]], data: Sequence[str
     different values. Keys of the data (`data`: each config's digest) are returned only if they differ between
     data sets with the same name."""
     flats = [flatten(config) for config in configs]
-    counting = {
-        key for config in configs for key in select_training_config(config)
-    } | _list_differing_data_keys(flats, data)
-    counting |= {
-        key for flat in flats for key in flat if key.startswith(("evaluation.ik", "export.precision"))
-    }
-    names = [key for key in dict.fromkeys(key for flat in flats for key in flat) if key in counting]
+    counting = _list_differing_data_keys(flats, data).union(*map(select_training_config, configs))
+    every = list(dict.fromkeys(key for flat in flats for key in flat))
+    names = [key for key in every if key in counting or key.startswith(("evaluation.ik", "export.precision"))]
     different = [key for key in names if len({repr(flat.get(key)) for flat in flats}) > 1]
     changed = {key.removesuffix(".name") for key in different if key.endswith(".name")}
     return [

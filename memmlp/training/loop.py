@@ -97,14 +97,12 @@ def train(
     if start and distributed.is_first():
         notify(f"{description}: resumes from the last checkpoint, at step {start} of {settings.steps}")
     distributed.copy_from_first(task.module)
-    with show_progress(
-        description, settings.steps, start, shown=distributed.is_first(), unit="steps"
-    ) as count:
+    first = distributed.is_first()
+    with show_progress(description, settings.steps, start, shown=first, unit="steps") as count:
         for step in range(start, settings.steps):
             seed_step(seed, step)
             result = train_step(task, settings, optimiser, step)
             average.update(step + 1)
-            first = distributed.is_first()
             validation = record(task, settings, average, run, step + 1, result, count) if first else {}
             if validation:
                 best.update(step + 1, validation, average)
@@ -177,9 +175,8 @@ def gather_step_result(result: StepResult) -> StepResult:
         return result
     terms = torch.stack([result.loss, *result.terms.values()])
     loss, *means = distributed.average(terms.detach())
-    return StepResult(
-        loss, dict(zip(result.terms, means, strict=True)), distributed.gather_rows(result.clips)
-    )
+    named = dict(zip(result.terms, means, strict=True))
+    return StepResult(loss, named, distributed.gather_rows(result.clips))
 
 
 def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
@@ -240,14 +237,11 @@ def save(
     if not distributed.is_first():
         return
     rates = [group["initial_lr"] for group in optimiser.param_groups]
-    tensors = checkpoint.collect_module_tensors("module", task.module) | checkpoint.collect_optimiser_tensors(
-        optimiser
-    )
-    tensors |= average.tensors() | best.tensors()
+    tensors = checkpoint.collect_module_tensors("module", task.module)
+    tensors |= checkpoint.collect_optimiser_tensors(optimiser) | average.tensors() | best.tensors()
     tensors["rng.torch"] = torch.get_rng_state()
-    checkpoint.write(
-        run.checkpoint, tensors, {"step": step, "initial_lr": rates, "seconds": seconds, **best.values()}
-    )
+    values = {"step": step, "initial_lr": rates, "seconds": seconds, **best.values()}
+    checkpoint.write(run.checkpoint, tensors, values)
 
 
 def resume(
@@ -306,7 +300,6 @@ class BestWeights:
 
     def load(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
         """Restore the kept weights from a checkpoint."""
-        self.weights = {
-            name.removeprefix("best."): one for name, one in tensors.items() if name.startswith("best.")
-        }
+        kept = [name for name in tensors if name.startswith("best.")]
+        self.weights = {name.removeprefix("best."): tensors[name] for name in kept}
         self.step, self.error = values.get("best", (0, math.inf))

@@ -266,10 +266,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: PreparedMotion, modes: 
 
 def draw_first_clip(model: MotionModel, test: MotionDataset, path: Path) -> None:
     """Draw prediction and truth for the start of the first test clip, as a PNG."""
-    from memmlp.report.pictures.clip_pictures import (
-        ClipPiece,
-        write_picture,  # matplotlib takes 0.5 s to import
-    )
+    from memmlp.report.pictures.clip_pictures import ClipPiece, write_picture  # matplotlib takes 0.5 s
 
     truth, predicted = predict_first_clip(model, test)
     write_picture(path, ClipPiece(test.names[0], truth, {"prediction": predicted}))

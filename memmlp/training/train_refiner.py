@@ -41,9 +41,8 @@ class SAGERefinerLoss(Loss):
     def __init__(self) -> None:
         super().__init__()
         weights = {"rotation_all": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
-        self.weighting = FixedWeights(
-            {**weights, "position_from_pelvis": 0.01, "trackers": 0.01, "jerk": 0.03}
-        )
+        weights |= {"position_from_pelvis": 0.01, "trackers": 0.01, "jerk": 0.03}
+        self.weighting = FixedWeights(weights)
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
@@ -62,12 +61,9 @@ def _smooth_l1(error: Tensor) -> Tensor:
     return F.smooth_l1_loss(error, error.new_zeros(()).expand_as(error))
 
 
-JOINT_LOSS_WEIGHTS: dict[str, Any] = {
-    "orientation": 0.01,
-    "rotation": 0.01,
-    "world_position": 0.01,
-    "hand": 0.01,
-}
+JOINT_LOSS_WEIGHTS: dict[str, Any] = dict.fromkeys(
+    ("orientation", "rotation", "world_position", "hand"), 0.01
+)
 JOINT_LOSS_WEIGHTS |= {"velocity": 60.0, "velocity_3": 20.0, "jerk": 0.03}
 """Weights of the loss that compares joint movements, as in SAGE-Net's loss."""
 

@@ -114,17 +114,13 @@ class SAGEPrerequisiteSettings(Settings):
     def prerequisites(cls, config: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield each part with the config keys that affect its result, in training order."""
         for kind in PARTS:
-            loss = {"loss": config["loss"]} if kind == "decoder" else {}
-            yield (
-                kind,
-                {
-                    **{key: config[key] for key in ("profile", "data", "normalizer", "seed")},
-                    **loss,
-                    "model": {key: config["model"][key] for key in cls.model_keys[kind]},
-                    "prerequisite": {key: config["prerequisite"][key] for key in ("name", kind)},
-                    "optim": {"precision": config["optim"]["precision"]},
-                },
-            )
+            own: dict[str, Any] = {key: config[key] for key in ("profile", "data", "normalizer", "seed")}
+            if kind == "decoder":
+                own["loss"] = config["loss"]
+            own["model"] = {key: config["model"][key] for key in cls.model_keys[kind]}
+            own["prerequisite"] = {key: config["prerequisite"][key] for key in ("name", kind)}
+            own["optim"] = {"precision": config["optim"]["precision"]}
+            yield kind, own
 
     def trainings(self, config: Mapping[str, Any], network: NetworkTraining) -> Iterator[SAGEPartTraining]:
         """Yield the training of each part, in order. The parts use the same window sampling as the whole

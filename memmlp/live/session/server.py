@@ -88,16 +88,17 @@ class Hub:
     def publish(self, message: Mapping[str, Any]) -> None:
         """Send a frame's message to all open pages."""
         with self.changed:
-            self.count += 1
-            self.frames.append((self.count, encode_event("frame", message)))
-            self.changed.notify_all()
+            self.frames.append((self._count_up(), encode_event("frame", message)))
 
     def publish_state(self, name: str, state: Mapping[str, Any]) -> None:
         """Send a state to all open pages, and to later pages until the state changes."""
         with self.changed:
-            self.count += 1
-            self.states[name] = self.count, encode_event(name, state)
-            self.changed.notify_all()
+            self.states[name] = self._count_up(), encode_event(name, state)
+
+    def _count_up(self) -> int:
+        self.count += 1
+        self.changed.notify_all()
+        return self.count
 
     def stream_events(self) -> Iterator[bytes]:
         """Yield the current states, then all new events, until the hub is closed."""

@@ -87,18 +87,14 @@ def parse_osc_packet(datagram: bytes) -> Packet:
     logging.disable(logging.WARNING)  # the library warns about each unreadable datagram
     try:
         parts = [part for part in OscBundle(datagram) if isinstance(part, OscMessage)]
-        arguments = {part.address.removeprefix(PREFIX): _read_arguments(part) for part in parts}
+        values = {part.address.removeprefix(PREFIX): list(part.params) for part in parts}
     except Exception as error:  # the library raises many kinds of errors
         raise InputError(f"packet: must be an OSC bundle ({error})") from None
     finally:
         logging.disable(logging.NOTSET)
-    numbers = {key: values[0] for key in ("time", "seq") if (values := arguments.get(key))}
+    arguments = {key: None if all(one is None for one in many) else many for key, many in values.items()}
+    numbers = {key: many[0] for key in ("time", "seq") if (many := arguments.get(key))}
     return read_packet(arguments | numbers)
-
-
-def _read_arguments(message: Any) -> list[Any] | None:
-    values = list(message.params)
-    return None if all(value is None for value in values) else values
 
 
 def read_packet(fields: Mapping[str, Any]) -> Packet:

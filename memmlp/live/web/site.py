@@ -93,11 +93,8 @@ def pack_clip(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
     first = (len(frames) - count) // 2
     clip = TrackedClip(name, frames[first : first + count])
     rotations = matrix_to_quaternion(SPACE.convert_rotations_from_amass(clip.rotations).reshape(-1, 3, 3))
-    parts = [
-        SPACE.convert_positions_from_amass(clip.positions),
-        rotations,
-        SPACE.convert_positions_from_amass(clip.joints),
-    ]
+    positions, joints = map(SPACE.convert_positions_from_amass, (clip.positions, clip.joints))
+    parts = [positions, rotations, joints]
     content = np.concatenate([part.reshape(count, -1) for part in parts], 1).astype("<f4").tobytes()
     return SiteClip(hashlib.sha256(content).hexdigest()[:12], name, content)
 

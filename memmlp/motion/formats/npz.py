@@ -52,10 +52,7 @@ BLOCK = 2**23  # maximum number of bytes per read
 MAX_HEADER = 10_000  # bytes of an npy header, as in np.load
 MAX_ROWS = 500_000  # frames: an hour at 120 Hz is 432,000
 MAX_SCALAR = 1_024  # maximum size of a scalar array, bytes
-METHODS = (
-    zipfile.ZIP_STORED,
-    zipfile.ZIP_DEFLATED,
-)  # the methods of NumPy; others do not limit the unpacked size
+METHODS = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED  # NumPy's; others do not limit the unpacked size
 
 
 class NoMotionError(InputError):

@@ -26,11 +26,7 @@ HINGES = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.0, 0.0), 16: (0.0, -1.0, 0.0), 17: (0.0
 
 LEFT, UP = np.eye(3)[:2]
 LEG_LENGTH = (0.55, 1.15)  # metres from hip to ankle in adults
-TRUNK, THIGHS, SHINS = (
-    45.0,
-    60.0,
-    75.0,
-)  # degrees: maximum angles from the vertical in a stance, including running
+TRUNK, THIGHS, SHINS = 45.0, 60.0, 75.0  # degrees: maximum angles from the vertical, including running
 LEVEL = 30.0  # degrees: maximum angle between the hip line and the horizontal in a stance
 ARMS = 100.0  # degrees: maximum angle between an arm's bone and its T-pose direction in a zero pose
 SHORTEST = 1e-3  # metres
@@ -215,15 +211,9 @@ def find_hinge_axis(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.
     motion, in the frame of thigh or upper arm, whose global rotations (N, 3, 3) are `upper`; None if the limb
     bends too little or about different axes."""
     middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
-    bones = (
-        normalize_vectors(positions[:, middle] - positions[:, joint]),
-        normalize_vectors(positions[:, end] - positions[:, middle]),
-    )
-    bends = np.einsum("nij,ni->nj", upper, np.cross(*bones))
+    bones = np.diff(positions[:, [joint, middle, end]], axis=1)
+    bends = np.einsum("nij,ni->nj", upper, np.cross(*normalize_vectors(bones).swapaxes(0, 1)))
     total, sizes = bends.sum(0), np.linalg.norm(bends, axis=-1)
-    is_clear = (
-        sizes.mean() > HINGE_BEND
-        and np.ptp(sizes) > HINGE_BEND
-        and np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
-    )
-    return normalize_vectors(total) if is_clear else None
+    bent = min(sizes.mean(), np.ptp(sizes)) > HINGE_BEND
+    agreeing = np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
+    return normalize_vectors(total) if bent and agreeing else None

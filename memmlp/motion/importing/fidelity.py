@@ -30,15 +30,9 @@ from memmlp.motion.plausibility import explain_implausibility, find_faults
 MOST_MM, MOST_DEGREES = 1.0, 3.0  # maximum errors of a valid import
 SHORTEST = 1e-2  # metres: directions of shorter segments are ignored
 LENGTHS = (0.5, 2.0)  # range of a limb's length relative to the legs, divided by this ratio on the body
-CHEST, HEAD_TURN, HEAD_SHARE = (
-    9,
-    110.0,
-    0.01,
-)  # degrees: no neck turns farther; fraction of frames that may exceed it
-TORSO, TURN = (
-    (3, 6, 9, 12, 13, 14, 15),
-    60.0,
-)  # spine, neck, collars, head; maximum degrees relative to the parent
+CHEST, HEAD_TURN = 9, 110.0  # degrees: no neck turns farther
+HEAD_SHARE = 0.01  # fraction of the frames that may exceed HEAD_TURN
+TORSO, TURN = (3, 6, 9, 12, 13, 14, 15), 60.0  # from spine to head; maximum degrees relative to the parent
 TWIST = 45.0  # degrees: maximum deviation of a knee's or elbow's axis from the body's axis
 SIDES = 1.1  # maximum ratio of the lengths of left and right limbs
 STRETCH = 0.02  # metres: maximum change of a segment's length
@@ -82,10 +76,8 @@ def compare_with_recording(clip: Clip, motion: MappedMotion, rest: np.ndarray, s
     made. `skeleton` is the name of its map."""
     rotations, positions = compute_clip_kinematics(clip, rest)
     expected, mapped = motion.positions @ Z_UP.T, motion.mapped
-    mm, degrees = (
-        _measure_distance(rotations, expected, mapped),
-        _measure_deviation(positions, expected, mapped),
-    )
+    mm = _measure_distance(rotations, expected, mapped)
+    degrees = _measure_deviation(positions, expected, mapped)
     impossible = explain_implausibility(clip)
     faults = (
         *_find_map_faults(mm, degrees, expected, mapped),

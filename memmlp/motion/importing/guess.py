@@ -94,8 +94,9 @@ def guess_map(recording: Recording, name: str) -> MapGuess:
     }
     for side in ("left", "right"):
         ankle = node_of.get(f"{side}_ankle")
-        tips = [] if ankle is None or f"{side}_foot" in node_of else tree.list_children(ankle)
-        node_of |= {f"{side}_foot": tips[0]} if len(tips) == 1 else {}
+        tips = [node for node, parent in enumerate(tree.parents) if parent == ankle]
+        if f"{side}_foot" not in node_of and len(tips) == 1:
+            node_of[f"{side}_foot"] = tips[0]
     joints = {joint: recording.nodes[node_of[joint]] for joint in JOINTS if joint in node_of}
     skeleton = SkeletonMap(name, joints, calibration_frame=measure_first_step(recording) > JUMP)
     return MapGuess(skeleton, tuple(joint for joint in joints if joint not in by_name))
@@ -112,9 +113,6 @@ class _Tree:
         while self.parents[line[0]] >= 0:
             line.insert(0, self.parents[line[0]])
         return line
-
-    def list_children(self, node: int) -> list[int]:
-        return [child for child, parent in enumerate(self.parents) if parent == node]
 
     def is_end(self, node: int) -> bool:
         return self.nodes[node].endswith(END)

@@ -215,14 +215,10 @@ def _parse_map(path: Path, content: object) -> SkeletonMap:
 
 
 def _is_rest(value: object) -> bool:
-    return value is None or (
-        isinstance(value, dict)
-        and value != {}
-        and all(
-            _is_text(node) and isinstance(turns, list) and all(is_number(turn, -360, 360) for turn in turns)
-            for node, turns in value.items()
-        )
-    )
+    if value is None or not isinstance(value, dict) or not value:
+        return value is None
+    angles = [angle for turns in value.values() for angle in (turns if isinstance(turns, list) else [None])]
+    return all(map(_is_text, value)) and all(is_number(angle, -360, 360) for angle in angles)
 
 
 def _is_text(value: object) -> bool:

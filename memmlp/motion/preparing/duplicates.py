@@ -41,9 +41,7 @@ ALIKE = 0.2  # degrees: maximum mean deviation; repetitions by one person differ
 NEAR = 0.05  # maximum distance between the signatures of two marked frames that are compared
 SIGNATURE = 24  # numbers per signature
 MIRRORED = np.array(SWAPPED[1:]) - 1  # the mirrored joint of each joint, without the root
-SIGNS = (
-    np.outer((-1, 1, 1), (-1, 1, 1)).reshape(9).astype(np.float32)
-)  # signs of S R S with S = diag(-1, 1, 1)
+SIGNS = np.outer((-1, 1, 1), (-1, 1, 1)).ravel().astype(np.float32)  # of S R S with S = diag(-1, 1, 1)
 
 
 def assign_parts(
@@ -198,12 +196,9 @@ def _mark_rotations(turns: np.ndarray) -> MarkedFrames:
         extrema |= set(np.flatnonzero(signal == maximum_filter1d(signal, 2 * REACH + 1)))
     inside = sorted(frame for frame in extrema if REACH <= frame < len(turns) - REACH)
     stretches = ((frame, turns[frame - REACH : frame + REACH + 1]) for frame in inside)
-    moving = [
-        frame for frame, each in stretches if _measure_angles(each, turns[frame]).max(0).mean() >= MOVING
-    ]
-    return MarkedFrames(
-        np.array(moving, int), _interpolate_extrema(sums, np.array(moving, int)).astype(np.float32)
-    )
+    moving = [at for at, each in stretches if _measure_angles(each, turns[at]).max(0).mean() >= MOVING]
+    marked = np.array(moving, int)
+    return MarkedFrames(marked, _interpolate_extrema(sums, marked).astype(np.float32))
 
 
 def _interpolate_extrema(sums: np.ndarray, frames: np.ndarray) -> np.ndarray:
@@ -277,10 +272,7 @@ APART = 15  # frames between marked frames, at least
 AROUND = np.arange(-30, 31, 3)  # frames around a marked frame that make its signature
 VARIED = 0.15  # minimum standard deviation of a signature
 TAKES_NEAR = 0.15  # maximum distance between the signatures of marked frames that are compared
-TAKE_REACH, SHORTEST = (
-    60,
-    75,
-)  # frames that are compared before and after a marked frame; minimum of all frames
+TAKE_REACH, SHORTEST = 60, 75  # frames that are compared before and after a marked one; minimum in all
 PELVIS, LIMBS = 0.5, 0.15  # degrees, and fraction of the motion: maximum differences; measured: 0.05 and 0.1
 
 

@@ -17,6 +17,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -352,9 +353,8 @@ class SubsetSplit(PublishedSplit):
         return dict.fromkeys((*self.train, *self.test), 1)
 
     def describe(self) -> dict[str, Any]:
-        return {
-            "kind": "subsets", "train": list(self.train), "test": list(self.test), **self._describe_settings()
-        }  # fmt: skip
+        lists = {"train": list(self.train), "test": list(self.test)}
+        return {"kind": "subsets", **lists, **self._describe_settings()}
 
 
 # Published lists
@@ -387,19 +387,18 @@ def _read_lists(folder: Path) -> dict[str, str]:
     files = {part: sorted(folder.rglob(f"{part}_split.txt")) for part in LISTED}
     if not files["train"]:
         raise InputError(f"data.split.folder={folder}: has no SUBSET/train_split.txt")
-    for subfolder in sorted({file.parent for part in LISTED for file in files[part]}):
-        for part in LISTED:
-            if subfolder / f"{part}_split.txt" not in files[part]:
-                raise InputError(
-                    f"data.split.folder={folder}: {subfolder} lacks {part}_split.txt; "
-                    "each subset must have both lists; a list may be empty"
-                )
+    every = [(part, file) for part in LISTED for file in files[part]]
+    for subfolder, part in product(sorted({file.parent for _, file in every}), LISTED):
+        if subfolder / f"{part}_split.txt" not in files[part]:
+            raise InputError(
+                f"data.split.folder={folder}: {subfolder} lacks {part}_split.txt; each subset must have both "
+                "lists; a list may be empty"
+            )
     entries: dict[str, str] = {}
-    for part in LISTED:
-        for file in files[part]:
-            for name in _read_list(file):
-                if entries.setdefault(name, part) != part:
-                    raise InputError(f"{file}: {name} is in both a train list and a test list")
+    for part, file in every:
+        for name in _read_list(file):
+            if entries.setdefault(name, part) != part:
+                raise InputError(f"{file}: {name} is in both a train list and a test list")
     return entries
 
 
@@ -409,14 +408,8 @@ def _read_list(file: Path) -> Iterator[str]:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{file}: cannot be read as a list ({error})") from error
+    subset = normalize_subset(file.parent.name)
     for line in filter(None, map(str.strip, lines)):
         steps = [step for step in line.removesuffix(".npz").split("/") if step not in ("", ".")]
-        start = next(
-            (
-                i
-                for i, step in enumerate(steps[:-1])
-                if normalize_subset(step) == normalize_subset(file.parent.name)
-            ),
-            0,
-        )
-        yield "/".join(steps[start:])
+        above = [i for i, step in enumerate(steps[:-1]) if normalize_subset(step) == subset]
+        yield "/".join(steps[above[0] if above else 0 :])

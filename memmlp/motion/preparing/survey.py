@@ -70,9 +70,7 @@ def survey_folder(root: Root, min_frames: int = 2, strict: bool = False) -> Surv
             _check_name(path, file, clips)
             clip = read_clip(path, name)
             faults = check_plausible(path, clip)
-            resampled, method = resample(
-                clip, interpolation=LINES
-            )  # the result does not depend on the method
+            resampled, method = resample(clip, interpolation=LINES)  # the result does not depend on it
             if len(resampled) < min_frames:
                 few = f"{len(resampled)} frames at {FPS} Hz"
                 raise TooShortError(f"{path}: {few}, fewer than data.min_frames={min_frames}")
@@ -81,11 +79,8 @@ def survey_folder(root: Root, min_frames: int = 2, strict: bool = False) -> Surv
         except InputError as error:
             if strict:
                 raise
-            skipped.append(
-                SkippedFile(
-                    escape_line_breaks(file), str(error).removeprefix(escape_line_breaks(f"{path}: "))
-                )
-            )
+            reason = str(error).removeprefix(escape_line_breaks(f"{path}: "))
+            skipped.append(SkippedFile(escape_line_breaks(file), reason))
             short += [name] if isinstance(error, TooShortError) else []
         else:
             digests = file_digest(path), _compute_content_digest(clip)
