@@ -18,9 +18,7 @@ from memmlp.common.errors import InputError
     type=PATH,
     help="Folder for the true and predicted motion, with one npz file per test clip.",
 )
-@click.option(
-    "--json", "json_path", type=PATH, help="JSON file for the metrics: means, and one row per clip."
-)
+@click.option("--json", "json_path", type=PATH, help="JSON file for the metrics: means, a row per clip.")
 @click.option("--again", is_flag=True, help="Repeat existing measurements.")
 @device_option
 @plugins_option

@@ -230,9 +230,7 @@ def write_lower(opened: OpenedRun, out: Path, form: ExportForm, max_growth: floa
         cost = compare_accuracy(exact, other, precision, network.normalizer, test)
         line = f"on test clips {describe_cost(cost, precision)}"
         if not cost["growth"] <= max_growth:
-            raise click.ClickException(
-                f"{out}: not written: {line}, more than --max-growth {100 * max_growth:g} %"
-            )
+            raise click.ClickException(f"{out}: not written: {line}; --max-growth is {100 * max_growth:g} %")
         if form.full:
             write_graph(network, exact, opened.run.id, form)
             write_lower_precision(precision, exact, other, network, train)

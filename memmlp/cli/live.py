@@ -81,12 +81,8 @@ class LiveOptions(NamedTuple):
     help="Clip to play: a test clip's name, or an AMASS npz file.  [default: the run's first test clip; the "
     "shipped clip for shipped networks and ONNX files]",
 )
-@click.option(
-    "--udp", type=PORT, metavar="PORT", help="Receive tracker poses as JSON packets at this UDP port."
-)
-@click.option(
-    "--osc", type=PORT, metavar="PORT", help="Receive tracker poses as OSC bundles at this UDP port."
-)
+@click.option("--udp", type=PORT, metavar="PORT", help="UDP port of tracker poses as JSON packets.")
+@click.option("--osc", type=PORT, metavar="PORT", help="UDP port of tracker poses as OSC bundles.")
 @click.option(
     "--sender",
     "senders",

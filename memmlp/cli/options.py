@@ -116,9 +116,7 @@ def add_page_options(port: int) -> Callable[[Command], Command]:
     """Add the options --port, with the default `port`, and --no-browser to a command that serves a page."""
     limits, help_text = click.IntRange(0, 65535), "Port of the page; 0 selects a free port."
     number = click.option("--port", default=port, type=limits, help=help_text)
-    browser = click.option(
-        "--no-browser", is_flag=True, help="Print the page's address without opening a browser."
-    )
+    browser = click.option("--no-browser", is_flag=True, help="Print the page's address; open no browser.")
     return lambda command: number(browser(command))
 
 
@@ -172,9 +170,7 @@ format_option = click.option(
 body_option = click.option(
     "--body", default="builtin", help="Body to use: builtin, or the path of an SMPL-H model.npz."
 )
-strict_option = click.option(
-    "--strict", is_flag=True, help="Stop at the first bad file instead of skipping it."
-)
+strict_option = click.option("--strict", is_flag=True, help="Stop at the first bad file; do not skip it.")
 
 
 def check_runs_exist(outputs: Path, *names: str) -> None:

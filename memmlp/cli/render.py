@@ -54,7 +54,7 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
     help="End of the piece, seconds.  [default: the clip's end]",
 )
 @click.option(
-    "--poses", default=6, type=click.IntRange(1, 20), help="Number of poses in a PNG, evenly spaced."
+    "--poses", default=6, type=click.IntRange(1, 20), help="Number of evenly spaced poses in a PNG."
 )
 @plugins_option
 @outputs_option
@@ -83,9 +83,7 @@ def render(
 
     check_picture_path(out, "--out")
     if labels and len(labels) != len(runs):
-        raise InputError(
-            f"--label: {len(labels)} labels for {len(runs)} runs; give one label for each run, or none"
-        )
+        raise InputError(f"--label: {len(labels)} labels for {len(runs)} runs; give one for each, or none")
     opened = [open_run(outputs, run) for run in runs]
     names = labels or tuple(run.run.id[:8] for run in opened)
     if len(set(names)) < len(names):

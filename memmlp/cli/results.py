@@ -37,9 +37,7 @@ def results() -> None:
 @results.command("save")
 @click.argument("name", metavar="SWEEP")
 @click.argument("overrides", nargs=-1)
-@click.option(
-    "--out", type=HomePath(file_okay=False), default=FOLDER / "data", help="Folder for the results file."
-)
+@click.option("--out", type=HomePath(file_okay=False), default=FOLDER / "data", help="Folder of the file.")
 @click.option(
     "--untrained",
     is_flag=True,
@@ -120,9 +118,7 @@ def show(name: str, source: str | None, together: tuple[str, ...], folder: Path)
     path = folder / "data" / f"{name}.json"
     if not path.is_file():
         names = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
-        raise InputError(
-            f"{path}: no results with this name; must be one of: {names or '(no results are kept)'}"
-        )
+        raise InputError(f"{path}: no such results; must be one of: {names or '(nothing is kept)'}")
     print_tables([_make_table(load_kept_results(path), source, together)])
 
 
@@ -170,9 +166,7 @@ def make_tables(folder: Path) -> dict[str, KeptTable]:
     from memmlp.report.result_pages import KeptTable
 
     if not (folder / "data").is_dir():
-        raise InputError(
-            f"{folder}/data: no such folder; create it with: memmlp results save --out {folder}/data"
-        )
+        raise InputError(f"{folder}/data: no such folder; memmlp results save --out {folder}/data makes it")
     tables = {}
     for path in sorted((folder / "data").glob("*.json")):
         kept = load_kept_results(path)

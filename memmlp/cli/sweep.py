@@ -236,9 +236,7 @@ def load_rounds(sweep: Sweep, outputs: Path, max_seeds: int | None) -> Rounds:
         return start_rounds(sweep, max_seeds or MAX_SEEDS)
     wanted = start_rounds(sweep, max_seeds or len(kept.seeds))
     if len(wanted.seeds) != len(kept.seeds):
-        raise InputError(
-            f"--max-seeds {max_seeds}: must be {len(kept.seeds)}, as in the saved analyses of {path}"
-        )
+        raise InputError(f"--max-seeds {max_seeds}: must be {len(kept.seeds)}, as in the analyses in {path}")
     if other := kept.find_difference(wanted):
         raise InputError(
             f"{path}: the interim analyses in this file have other {other}; remove the file to restart them"
@@ -323,9 +321,7 @@ def describe_end(rounds: Rounds, sweep: Sweep) -> list[str]:
     if without:
         lines.append(f"no verdict, because there is nothing to compare: {', '.join(without)}")
     if any(finding.p is None for finding in still):
-        lines.append(
-            "no number of seeds is enough: all test clips form one group, or a network diverged on a clip"
-        )
+        lines.append("no number of seeds is enough: all test clips form one group, or a network diverged")
     used, variants = sum(rounds.count_seeds(sweep).values()), len(sweep.list_runnable())
     last = max((one.seeds for one in rounds.analyses), default=rounds.schedule[0])
     fixed = [

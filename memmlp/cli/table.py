@@ -44,9 +44,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     type=click.Choice(["md", "tex", "json"]),
     help="Output format.  [default: a table for the screen]",
 )
-@click.option(
-    "--out", type=HomePath(dir_okay=False), help="File to write the table to; its suffix sets the format."
-)
+@click.option("--out", type=HomePath(dir_okay=False), help="File to write; its suffix sets the format.")
 @click.option(
     "--mode",
     type=click.Choice(list(SHOWN_MODES)),

@@ -73,9 +73,8 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
 def _run_with_hydra(args: argparse.Namespace, train_from_config: Callable[[DictConfig], None]) -> None:
     """Run or print the jobs with Hydra, which reads its arguments from `sys.argv`. Errors of Hydra are raised
     as InputError, with a message in one line."""
-    main = hydra.main(
-        config_path=str(find_packaged_folder("conf")), config_name=CONFIG, version_base=VERSION_BASE
-    )
+    folder = str(find_packaged_folder("conf"))
+    main = hydra.main(config_path=folder, config_name=CONFIG, version_base=VERSION_BASE)
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv, os.environ["HYDRA_FULL_ERROR"] = ["memmlp train", *format_hydra_arguments(args)], "1"
     try:

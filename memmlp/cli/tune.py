@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 @click.argument("overrides", nargs=-1)
 @add_worker_options
 @click.option("--status", is_flag=True, help="Only show the search's progress.")
-@click.option(
-    "--config-dir", type=PATH, help="Folder of additional configs; they can refer to your own classes."
-)
+@click.option("--config-dir", type=PATH, help="Folder of more configs; they can name your own classes.")
 @plugins_option
 @outputs_option
 def tune(

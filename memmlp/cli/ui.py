@@ -73,9 +73,7 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
 
 @click.command("report")
 @click.argument("sweeps", nargs=-1)
-@click.option(
-    "--out", type=HomePath(dir_okay=False), help="HTML file to write.  [default: report.html in --outputs]"
-)
+@click.option("--out", type=HomePath(dir_okay=False), help="HTML file.  [default: report.html in --outputs]")
 @click.option("--no-replays", is_flag=True, help="Write a smaller file, without 3D replays of clips.")
 @plugins_option
 @outputs_option

@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 @click.command("web")
 @click.argument("runs", nargs=-1, required=True)
 @click.option("--out", required=True, type=PATH, help="Folder to write the site into.")
-@click.option(
-    "--clips", default=3, type=click.IntRange(1, 50), help="Number of test clips to include from each run."
-)
+@click.option("--clips", default=3, type=click.IntRange(1, 50), help="Number of test clips of each run.")
 @click.option(
     "--seconds",
     default=20.0,

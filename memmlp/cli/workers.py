@@ -44,9 +44,7 @@ class Workers:
         given = {"--gpus-per-worker": self.gpus_per_worker, "--workers-per-gpu": self.workers_per_gpu}
         for option, value in given.items():
             if value is not None and self.executor != "local":
-                raise InputError(
-                    f"{option}: needs workers of this machine, executor=local, not {self.executor}"
-                )
+                raise InputError(f"{option}: needs workers of this machine, executor=local")
         self.parse_options()
 
     def parse_options(self) -> Any:
@@ -86,9 +84,7 @@ class Workers:
         gpus = list_visible_gpus() if gpu_devices and local and self.gpus_per_worker != 0 else ()
         for name in gpu_devices:
             if ":" in name:
-                raise InputError(
-                    f"device={name}: expected auto, cuda, cpu or mps; each worker has its own GPU"
-                )
+                raise InputError(f"device={name}: must be auto, cuda, cpu or mps; a worker has its own GPU")
             if local and name == "cuda" and not gpus:
                 raise InputError("device=cuda: no GPU is visible here; use device=cpu or device=auto")
         if gpus:

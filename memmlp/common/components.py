@@ -240,5 +240,5 @@ def _find_decorated(namespace: Mapping[str, Any], one: Component) -> Any:
     """Return the object in a module's namespace that declares the component; None without one."""
     option = f"{one.slot}={one.name}"
     return next(
-        (kind for kind in namespace.values() if getattr(kind, "__dict__", {}).get("option") == option), None
+        (one for one in namespace.values() if getattr(one, "__dict__", {}).get("option") == option), None
     )

@@ -123,9 +123,8 @@ def build_untrained(overrides: Sequence[str]) -> MotionModel:
     architecture = build_architecture(compose_config(list(overrides)))
     torch.manual_seed(0)
     codes = architecture.vqvae() if architecture.uses_codes else None
-    normalizer = Normalizer.from_coordinates(
-        architecture.coordinates, torch.as_tensor(make_builtin_rest_joints())
-    )
+    rest = torch.as_tensor(make_builtin_rest_joints())
+    normalizer = Normalizer.from_coordinates(architecture.coordinates, rest)
     return architecture.build(normalizer, codes).eval()
 
 
@@ -254,9 +253,7 @@ def load_config(run: Run, overrides: Sequence[str] = (), outputs: Path | None = 
         cfg = restore_config(run.config)
     except (OmegaConfBaseException, KeyError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(
-            f"{run.config_path}: this version of memmlp cannot read the config ({reason})"
-        ) from None
+        raise InputError(f"{run.config_path}: this version cannot read the config ({reason})") from None
     _use_outputs(cfg, outputs or find_outputs(run))
     if get_shipped_name(run) and not Path(str(cfg.data.root)).exists():
         cfg.data.root = escape_interpolations(str(find_shipped_clip().parent))
@@ -363,9 +360,8 @@ def _compose_default(overrides: tuple[str, ...]) -> dict[str, Any]:
     hydra = GlobalHydra.instance()
     before, hydra.hydra = hydra.hydra, None
     try:
-        with initialize_config_dir(
-            str(find_packaged_folder("conf")), version_base=VERSION_BASE, job_name="name"
-        ):
+        folder = str(find_packaged_folder("conf"))
+        with initialize_config_dir(folder, version_base=VERSION_BASE, job_name="name"):
             cfg = compose("train", list(overrides))
     finally:
         GlobalHydra.instance().hydra = before

@@ -176,9 +176,7 @@ def _describe_expected(name: str, schema: Any, error: OmegaConfBaseException) ->
         return f"{_describe_type(error.ref_type)} ({_get_first_line(error)})"
     own = name.split(".")[-1]
     hint = get_type_hints(schema).get(own, Any)
-    rule = next(
-        (field.metadata.get("rule") for field in dataclasses.fields(schema) if field.name == own), None
-    )
+    rule = next((one.metadata.get("rule") for one in dataclasses.fields(schema) if one.name == own), None)
     return _describe_type(hint) if rule is None else f"{_describe_type(hint)}, {rule}"
 
 

@@ -213,9 +213,7 @@ def _compose_components(options: Sequence[str]) -> DictConfig | None:
     special = any(override.signs or len(override.options) != 1 for override in chosen.values())
     if special or EXPERIMENT in chosen:
         return None
-    cfg: DictConfig = pickle.loads(
-        _compose_options(*(o.text for key, o in chosen.items() if key not in SLOTS))
-    )
+    cfg: DictConfig = pickle.loads(_compose_options(*(o.text for k, o in chosen.items() if k not in SLOTS)))
     names = {key: override.options[0] for key, override in chosen.items() if key in SLOTS}
     model = collect_components().get(("model", names.get("model") or cfg.model.name))
     if model is None or _has_defaults("model", cfg.model.name):
@@ -262,9 +260,7 @@ def _check_effects(cfg: DictConfig, overrides: Sequence[str]) -> None:
     sources = (cfg.data.get("sources") or {}).values()
     for override in parse_overrides(overrides):
         if override.key == "profile.lr" and cfg.optim.lr != cfg.profile.lr:
-            raise InputError(
-                f"{override}: has no effect, since model={cfg.model.name} sets optim.lr; set optim.lr"
-            )
+            raise InputError(f"{override}: has no effect: model={cfg.model.name} sets optim.lr; set that")
         part = override.key.removeprefix("data.split.")
         own = [one.get(part) for one in sources] if part in ("test", "val") else [None]
         if own and None not in own:

@@ -100,9 +100,7 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
             if (data_digest := _find_data_digest(request, prepare, data)) is not None:
                 tasks = make_tasks(request, data_digest)
                 planned.append((Entry(variant.label, seed, tasks[-1].id, tasks[-1].stages), tasks))
-    planned.sort(
-        key=lambda one: sweep.seeds.index(one[0].seed)
-    )  # an unfinished sweep should contain every variant
+    planned.sort(key=lambda one: sweep.seeds.index(one[0].seed))  # every variant soon has a run
     every_task = order_tasks(task for _, tasks in planned for task in tasks)
     plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in planned), every_task)
     if prepare:

@@ -85,9 +85,7 @@ def build_run_experiment(
         raise InputError(f"{words}: would change the training; set only keys of evaluation and export")
     for word in parse_overrides(overrides):
         if word.group not in EFFECTIVE_GROUPS and word.key not in INFERENCE:  # such as force=true
-            raise InputError(
-                f"{word}: has no effect on a finished run; set only keys of evaluation and export"
-            )
+            raise InputError(f"{word}: has no effect on a finished run; set keys of evaluation and export")
     return experiment
 
 

@@ -144,9 +144,7 @@ def _add_metric(name: str, one: Component) -> None:
     if not issubclass(facts, MetricSettings) or facts.smallest <= 0:
         raise InputError(f"metric {name}: expected MetricSettings with `smallest` above 0")
     if facts.better not in ("lower", "higher") or facts.of not in ("positions", "rotations"):
-        raise InputError(
-            f"metric {name}: `better` must be lower or higher, and `of` must be positions or rotations"
-        )
+        raise InputError(f"metric {name}: `better` must be lower or higher, `of` positions or rotations")
     UNITS[name], SMALLEST[name] = facts.unit, facts.smallest
     if facts.better == "higher":
         HIGHER.add(name)

@@ -272,9 +272,8 @@ class Stream:
         held = _list_lost(lost)
         world = self.wearer.scale_to_network(self.space.convert_positions_to_amass(positions))
         self.odd.take(time, world, lost)
-        frames, restarted = self._trackers.take(
-            time, world, self.space.convert_rotations_to_amass(rotations), lost
-        )
+        turned = self.space.convert_rotations_to_amass(rotations)
+        frames, restarted = self._trackers.take(time, world, turned, lost)
         if not frames:
             assert self._last is not None  # the first sample always makes a frame
             return self._last._replace(held=held, fresh=False, restarted=False)
@@ -344,9 +343,7 @@ class Stream:
         world = self.wearer.scale_to_network(self.space.convert_positions_to_amass(positions))
         across = world[1] - world[2]
         if np.hypot(*across[:2]) < APART:
-            raise InputError(
-                "calibrate: the hands are not apart; stand in a T-pose with the arms to the sides"
-            )
+            raise InputError("calibrate: the hands are not apart; stand in a T-pose, arms to the sides")
         heading = float(np.arctan2(across[1], across[0]))
         device = self.space.convert_rotations_to_amass(rotations)[0]
         upright = (device @ UPRIGHT.T)[2, 2] > np.cos(TILTED)

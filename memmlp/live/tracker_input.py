@@ -93,9 +93,7 @@ def _read_poses(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray
         try:
             position, rotation = (np.asarray(part, np.float64) for part in tracker)
         except (TypeError, ValueError) as error:
-            raise InputError(
-                f"{name}: expected (position, rotation) as arrays of numbers, or None"
-            ) from error
+            raise InputError(f"{name}: expected (position, rotation) as arrays, or None") from error
         if position.shape != (3,):
             raise InputError(f"{name}: position has shape {position.shape}; must be (3,), metres")
         if rotation.shape not in ((4,), (3, 3)):
@@ -119,9 +117,7 @@ def check_time(time: float | None) -> None:
     if time is None:
         return
     if not isinstance(time, (int, float, np.integer, np.floating)) or not abs(time) <= LATEST:
-        raise InputError(
-            f"time={time}: must be a number of seconds, at most {LATEST:g}, or None for one frame"
-        )
+        raise InputError(f"time={time}: must be seconds, at most {LATEST:g}, or None for one frame")
 
 
 ODD = {

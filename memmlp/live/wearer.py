@@ -94,7 +94,7 @@ class Offsets(NamedTuple):
 
 def check_offsets(offsets: Offsets) -> Offsets:
     """Return the offsets as float64 arrays. Raises InputError if they are malformed."""
-    expected = "must be memmlp.Offsets with positions (3, 3) and rotations (3, 3, 3)"
+    expected = "must be positions (3, 3) and rotations (3, 3, 3) in a memmlp.Offsets"
     try:
         positions, rotations = (np.asarray(part, np.float64) for part in offsets)
     except (TypeError, ValueError):
@@ -153,9 +153,7 @@ def read_calibration(path: Path, space: SpaceName, body: BodyTree) -> Calibratio
         with open(path, "rb") as file:
             fields = json.loads(file.read(LARGEST))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: is not a calibration file ({describe_read_error(error)}); {MADE}"
-        ) from None
+        raise InputError(f"{path}: not a calibration file ({describe_read_error(error)}); {MADE}") from None
     if not isinstance(fields, dict) or fields.get("memmlp") != "calibration":
         raise InputError(f"{path}: is not a calibration file; {MADE}")
     if fields.get("space") != find_space(space).name:

@@ -103,10 +103,8 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
     return joints[:N_JOINTS]
 
 
-_OTHER_SIDE = {"left": "right", "right": "left"}
-SWAPPED = tuple(
-    JOINTS.index("_".join(_OTHER_SIDE.get(part, part) for part in name.split("_"))) for name in JOINTS
-)
+_SIDES = {"left": "right", "right": "left"}
+SWAPPED = tuple(JOINTS.index("_".join(_SIDES.get(word, word) for word in name.split("_"))) for name in JOINTS)
 """The index of each joint's mirrored joint: left and right are exchanged."""
 
 

@@ -108,12 +108,8 @@ def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
     first, count = Counter(names.values()).most_common(1)[0]
     if count > 1:
         raise InputError(f"{source / first}: {count} npz files have this name; expected one")
-    targets = tuple(
-        ExportTarget(n, source / file, out / (n + target_format.suffix)) for file, n in names.items()
-    )
-    return ExportPlan(
-        targets, target_format, tuple(SkippedFile(*each) for each in content.unreadable.items())
-    )
+    targets = tuple(ExportTarget(n, source / f, out / (n + target_format.suffix)) for f, n in names.items())
+    return ExportPlan(targets, target_format, tuple(SkippedFile(*one) for one in content.unreadable.items()))
 
 
 def choose_format(out: Path, name: str | None, folder: bool) -> Format:

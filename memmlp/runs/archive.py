@@ -106,9 +106,7 @@ def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> tuple[s
     if any(one.compress_type not in METHODS for one in archive.infolist()):
         raise InputError(f"{path}: must be stored or deflated, as memmlp runs export does")
     if (total := sum(one.file_size for one in archive.infolist())) > max_size:
-        raise InputError(
-            f"{path}: must be at most {max_size / 1e9:.1f} GB (--max-gb), but is {total / 1e9:.1f} GB"
-        )
+        raise InputError(f"{path}: must be at most {max_size / 1e9:.1f} GB (--max-gb), not {total / 1e9:.1f}")
     return run_id, [name.partition("/")[2] for name in every]
 
 
@@ -143,6 +141,4 @@ def _check_unpacked_run(run: Run, path: Path) -> None:
     if not records.read(run.marker, records.Marker).get("artifacts"):
         raise InputError(f"{path}: {run.marker.name} must contain the digests of the run's artifacts")
     if changed := run.verify():
-        raise InputError(
-            f"{path}: must contain an unchanged run; missing or changed files: {', '.join(changed)}"
-        )
+        raise InputError(f"{path}: must contain an unchanged run; missing or changed: {', '.join(changed)}")

@@ -63,9 +63,8 @@ class DeploymentFolder:
 
         files = map(self.onnx_path, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}
-        write_json(
-            self.latency, {**record, "made": now(), "made_by": describe_environment(), "artifacts": artifacts}
-        )
+        facts = {"made": now(), "made_by": describe_environment(), "artifacts": artifacts}
+        write_json(self.latency, {**record, **facts})
 
     @property
     def record(self) -> dict[str, Any]:

@@ -256,9 +256,8 @@ class Run:
 
     def fail(self, reason: str, details: str = "") -> None:
         """Record the reason why the run failed."""
-        write_json(
-            self.folder / "FAILED", {"reason": " ".join(reason.split()), "when": now(), "details": details}
-        )
+        failure = {"reason": " ".join(reason.split()), "when": now(), "details": details}
+        write_json(self.folder / "FAILED", failure)
 
     def retry(self) -> None:
         """Remove the record of the failure, and stop counting the attempts that led to it."""

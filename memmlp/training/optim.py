@@ -60,18 +60,16 @@ class OptimSettings(Settings):
     clip_norm: float = setting(at_least(0), 0.0)  # maximum norm of the gradient; 0: no limit
     precision: str = setting(one_of("fp32", "bf16"), "fp32")
     compile: bool = setting(default=False)  # true: compile the network with torch.compile
-    checkpoint_every: int = setting(
-        at_least(1), "${profile.checkpoint_every}"
-    )  # number of steps between checkpoints
+    # number of steps between checkpoints
+    checkpoint_every: int = setting(at_least(1), "${profile.checkpoint_every}")
     # number of steps between validations; below 1: a fraction of all steps
     validate_every: int | float = setting(steps_or_fraction(zero=False), "${profile.validate_every}")
     # number of validation pieces of four seconds, evenly spread over the clips; null: all
     validation_pieces: int | None = setting(at_least(1), None)
     # rotation or position: the weights with this branch's lowest validation MPJPE are kept; null: the last
     best_by: str | None = setting(one_of("rotation", "position"), None)
-    log_every: int = setting(
-        at_least(1), "${profile.log_every}"
-    )  # number of steps between metrics log entries
+    # number of steps between metrics log entries
+    log_every: int = setting(at_least(1), "${profile.log_every}")
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
@@ -163,9 +161,7 @@ class Optim:
         budget `tflop` is too small for a step, or `spent` is unknown."""
         steps = self.steps
         if self.tflop is not None and spent is None:
-            raise InputError(
-                "optim.tflop: the prerequisite run has no record of its compute; remove its folder"
-            )
+            raise InputError("optim.tflop: the prerequisite run did not record its compute; remove it")
         if self.tflop is not None:
             steps = round((self.tflop - (spent or 0)) / step_tflop)
             if steps < 1:
@@ -243,9 +239,7 @@ class ScheduleFree(Optim):
 
     def check_installed(self) -> None:
         if find_spec("schedulefree") is None:
-            raise InputError(
-                "optim=schedule_free: needs the package schedulefree; pip install 'memmlp[schedulefree]'"
-            )
+            raise InputError("optim=schedule_free: needs schedulefree: pip install 'memmlp[schedulefree]'")
 
     def build(self, groups: list[dict]) -> Optimizer:
         self.check_installed()

@@ -202,9 +202,7 @@ def describe_low_rates(manifest: Manifest, clips: Sequence[ClipRecord], what: st
         return None
     hertz = f"{rates[0]:g}" + (f" to {rates[-1]:g}" if rates[-1] > rates[0] else "")
     slow = f"{len(rates)} of {len(clips)} {what} were recorded at {hertz} Hz"
-    return (
-        f"{slow} and were interpolated linearly (data.interpolation), which raises Jitter and velocity errors"
-    )
+    return f"{slow} and interpolated linearly (data.interpolation), which raises Jitter and velocity errors"
 
 
 def describe_skipped_files(skipped: Sequence[SkippedFile]) -> str | None:

@@ -162,9 +162,8 @@ class MotionTask(TrainingTask):
         self.rollout.keep(state)
         members = len(motion) // len(call.true_frames)  # a network may return the motion of several
         truth = call.true_frames[:, -motion.shape[1] :].expand(members, -1, -1, -1).flatten(0, 1)
-        loss, terms = self.loss(
-            motion, truth[..., SPARSE_DIM:], truth[..., :SPARSE_DIM], self.model.normalizer
-        )
+        sparse, truth = truth[..., :SPARSE_DIM], truth[..., SPARSE_DIM:]
+        loss, terms = self.loss(motion, truth, sparse, self.model.normalizer)
         return StepResult(sum(losses.values(), loss), terms | losses, call.clips)
 
     def average_over_draws(self, measure: Callable[[], float]) -> float:

@@ -18,7 +18,7 @@ skeleton_option = click.option(
     help="Name of a shipped skeleton map, or path of a map.  [default: detected from the joint names]",
 )
 up_option = click.option(
-    "--up", type=click.Choice(["y", "z"]), help="Up axis of the files.  [default: from the map]"
+    "--up", type=click.Choice(["y", "z"]), help="Up axis of files.  [default: the map's]"
 )
 
 

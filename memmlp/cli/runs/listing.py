@@ -54,9 +54,7 @@ NAME_WIDTH = 31  # minimum width of the column of names, in characters
 )
 @click.option("--where", help="Condition for runs to list, such as 'memory=gru and stream.MPJPE<6.3'.")
 @click.option("--sort", help="Key to sort by, such as stream.MPJPE; -KEY sorts in descending order.")
-@click.option(
-    "--columns", help="Comma-separated keys to show.  [default: config keys that differ between runs]"
-)
+@click.option("--columns", help="Comma-separated keys to show.  [default: differing config keys]")
 @outputs_option
 def list_runs(every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path) -> None:
     """List the runs, newest first. Without --all, finished VQ-VAEs and network parts are hidden.

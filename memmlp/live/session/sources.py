@@ -283,9 +283,7 @@ class PacketSource:
             self.socket.close()
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 raise
-            raise InputError(
-                f"port {port}: is in use or forbidden; use another port from 1024 to 65535"
-            ) from None
+            raise InputError(f"port {port}: is in use or forbidden; use another, 1024 to 65535") from None
         self.port = self.socket.getsockname()[1]
         self.name = f"{name} packets on port {self.port}"
         self.last: int | None = None

@@ -117,9 +117,7 @@ def read_bvh(path: Path) -> Bvh:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a BVH file") from error
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: invalid byte {error.object[error.start]:#04x}; expected UTF-8 text"
-        ) from error
+        raise InputError(f"{path}: invalid byte {error.object[error.start]:#04x}; must be UTF-8") from error
     return Bvh(path, tuple(names), tuple(parents), np.array(offsets), fps, values, tuple(channels))
 
 
@@ -188,9 +186,7 @@ def _read_hierarchy(
 
     def check(name: str) -> str:
         if name in ("{", "}") or name in names or name in ends:
-            words.fail(
-                f"name {_quote(name)}", "a unique name for each joint, and at most one end site per joint"
-            )
+            words.fail(f"name {_quote(name)}", "a unique name, and at most one end site per joint")
         return name
 
     words.read_keyword("HIERARCHY")

@@ -225,12 +225,8 @@ VRM_BONES = tuple(name[0].lower() + name[1:] for name in UNITY_BONES)
 LOOKS = (("body", (0.30, 0.42, 0.56, 1.0), 0.7), ("eyes", (0.012, 0.016, 0.022, 1.0), 0.25))
 """Name of the material, its linear RGB and opacity, and its roughness."""
 
-EYES = (
-    0.016,
-    0.036,
-    0.055,
-    0.100,
-)  # metres: radius; distance to the side of, above and in front of the head joint
+# metres: radius; distance to the side of, above and in front of the head joint
+EYES = 0.016, 0.036, 0.055, 0.100
 
 META = {
     "name": "memmlp mannequin",

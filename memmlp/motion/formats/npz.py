@@ -114,7 +114,7 @@ def _parse_rate(path: Path, value: np.ndarray) -> float:
     """Parse the rate from an array with one float, int, bytes or text element."""
     if value.size != 1 or value.dtype.kind not in "fiuSU":
         raise InputError(
-            f"{path}: the frame rate has type {value.dtype} and shape {value.shape}; must be one number"
+            f"{path}: the frame rate has type {value.dtype}, shape {value.shape}; must be a number"
         )
     try:
         item = value.item()

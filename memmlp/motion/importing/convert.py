@@ -155,9 +155,7 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
             raise InputError(f"{path}: in {source}, {fault}; check left and right in the map and the up axis")
         turn = anatomy.find_facing_turn(pose)
         nodes = skeleton.unit * nodes @ upright.T @ turn.T
-        untwisted = frozenset(
-            joint for joint in HINGES if stands and _is_untwisted(joint, rotations, motion.zero)
-        )
+        untwisted = frozenset(j for j in HINGES if stands and _is_untwisted(j, rotations, motion.zero))
         return Stance(turn @ rotations, pose @ turn.T, nodes, source, untwisted)
 
     if skeleton.rest is not None:
@@ -205,9 +203,7 @@ def _compute_rest(
     if not isinstance(rest, int):
         return recording.compute_pose(rest)
     if rest >= len(recording):
-        raise InputError(
-            f"{recording.path}: rest: frame {rest}: must be one of frames 0 to {len(recording) - 1}"
-        )
+        raise InputError(f"{recording.path}: rest: frame {rest}: must be from 0 to {len(recording) - 1}")
     rotations, positions = recording.compute_kinematics()
     return rotations[rest], positions[rest] - positions[rest, 0]
 
@@ -369,7 +365,7 @@ def _find_up(recording: Recording, trunk: np.ndarray, nodes: dict[str, int]) -> 
         for joint, node in nodes.items():
             pose[JOINTS.index(joint)] = zero[node]
         standing = next(
-            (a for a, turn in UPRIGHT.items() if anatomy.find_stance_fault(pose @ turn.T) is None), None
+            (a for a, turn in UPRIGHT.items() if not anatomy.find_stance_fault(pose @ turn.T)), None
         )
     upright = along[moving] >= UPRIGHT_SHARE
     if upright and standing in (None, moving):

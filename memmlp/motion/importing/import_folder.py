@@ -189,9 +189,7 @@ def _check_import(files: Mapping[Path, Path], out: Path, settings: ImportSetting
     for folder, rate in settings.fps.items():
         if folder not in folders or not is_number(rate, *FRAME_RATE_RANGE):
             choices = ", ".join(map(repr, folders))
-            raise InputError(
-                f"--fps {folder}={rate!r}: must be 1 to 1000 Hz for a folder of {choices} ('' means all)"
-            )
+            raise InputError(f"--fps {folder}={rate!r}: must be 1 to 1000 Hz for one of {choices} ('': all)")
 
 
 def _describe_clip(relative: Path, result: _ConvertedFile) -> ImportedClip:

@@ -188,15 +188,11 @@ def _parse_map(path: Path, content: object) -> SkeletonMap:
 
     required, optional = ("name", "joints"), ("unit", "up", "calibration_frame", "rest")
     if not isinstance(content, dict) or not set(required) <= set(content) <= {*required, *optional}:
-        raise InputError(
-            f"{path}: the keys must be {', '.join(required)}; optional keys are {', '.join(optional)}"
-        )
+        raise InputError(f"{path}: keys must be {', '.join(required)}, optionally {', '.join(optional)}")
     values: dict[str, Any] = {key: None if value == AUTO else value for key, value in content.items()}
     require(_is_text(values["name"]), "name", "text")
     unit, joints = values.get("unit"), values["joints"] or {}
-    require(
-        unit is None or is_number(unit, 1e-6, 1e3), "unit", "a number of metres from 1e-6 to 1000, or auto"
-    )
+    require(unit is None or is_number(unit, 1e-6, 1e3), "unit", "1e-6 to 1000 (metres), or auto")
     require(values.get("up") in ("y", "z", None), "up", "y, z or auto")
     require(isinstance(values.get("calibration_frame", False), bool), "calibration_frame", "true or false")
     if frame := re.fullmatch(r"frame (\d{1,6})", str(values.get("rest"))):
@@ -261,9 +257,7 @@ def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
     """Select the motion of the mapped joints in a recording, without a calibration frame. Raises InputError
     if nodes of the map are missing, the order of nodes differs from the body's, or no frame remains."""
     if missing := sorted(set(skeleton.joints.values()) - set(recording.nodes)):
-        raise InputError(
-            f"{recording.path}: has no {', '.join(missing)}; required by skeleton {skeleton.name}"
-        )
+        raise InputError(f"{recording.path}: has no {', '.join(missing)}, unlike skeleton {skeleton.name}")
     nodes = np.zeros(len(JOINTS), int)
     for joint, parent in enumerate(PARENTS):
         node = skeleton.joints.get(JOINTS[joint])

@@ -55,9 +55,7 @@ def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
     file is bad and `strict` is set; OSError if the disk is full or read-only."""
     source = replace(source, body=str(source.body))
     if source.min_frames < 2:
-        raise InputError(
-            f"data.min_frames={source.min_frames}: must be 2 or more, because one frame has no velocity"
-        )
+        raise InputError(f"data.min_frames={source.min_frames}: must be 2 or more; one frame has no velocity")
     rest = load_rest_joints(source.body)
     clips = [source.root / file for file in find_clips(source.root).files]
     check_imported_body(clips, rest, f"data.body={source.body}")

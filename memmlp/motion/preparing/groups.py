@@ -143,9 +143,7 @@ def describe_divided_folders(manifest: Manifest) -> str:
             if clip.group == clip.name and not _matches_pattern(split, name):
                 inner, *above = _list_folders(name)
                 # If each take has its own folder, the parent folder is the person's.
-                parts[next((folder for folder in (inner, *above) if held[folder] > 1), inner)].append(
-                    clip.split
-                )
+                parts[next((one for one in (inner, *above) if held[one] > 1), inner)].append(clip.split)
         folders += [
             (prefix + folder, splits.count("test"))
             for folder, splits in parts.items()

@@ -99,16 +99,12 @@ class Coverage:
         by_subset = [
             f"{name} {count} of {self.entry_counts[name]}" for name, count in self.missing_counts.items()
         ]
-        return (
-            f"{total - present} of {total} entries of the split's list have no clip ({', '.join(by_subset)})"
-        )
+        return f"{total - present} of {total} listed entries have no clip ({', '.join(by_subset)})"
 
     def check(self, root: Root) -> None:
         """Raise InputError unless every entry has a clip below the data folder."""
         if not self.is_complete:
-            raise InputError(
-                f"data.root={root}: {self.gap_description}; data.partial=true accepts an incomplete list"
-            )
+            raise InputError(f"data.root={root}: {self.gap_description}; data.partial=true accepts this")
 
 
 @dataclass(frozen=True)

@@ -96,9 +96,7 @@ class GroupedSplit(Split):
 
     def _check_fractions(self, **fractions: float) -> None:
         if not 0 < self.train_fraction <= 1:
-            raise InputError(
-                f"data.split.train_fraction={self.train_fraction}: must be above 0 and at most 1"
-            )
+            raise InputError(f"data.split.train_fraction={self.train_fraction}: must be above 0, at most 1")
         for key, value in fractions.items():
             if not 0 <= value < 1:
                 raise InputError(f"data.split.{key}={value}: must be at least 0 and below 1")

@@ -100,9 +100,7 @@ def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
     if escape_line_breaks(file) != file:
         raise InputError(f"{path}: the name has control characters; rename the file")
     if get_clip_name(file) in clips:
-        raise InputError(
-            f"{path}: {clips[get_clip_name(file)].file} has the same name; rename one of the files"
-        )
+        raise InputError(f"{path}: {clips[get_clip_name(file)].file} has the same name; rename one of them")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: not a regular file")
 

@@ -26,10 +26,7 @@ ANKLE_HEIGHT = 0.075  # metres above the floor, with a flat foot
 HEEL = np.array([0.0, -ANKLE_HEIGHT, -0.05])  # metres: vector from the ankle to the heel's contact point
 STRETCH = 0.993  # maximum fraction of its full length to which a standing leg stretches
 SPINE_SHARES = {"spine1": 0.3, "spine2": 0.3, "spine3": 0.4}
-LEG_POLE, ARM_POLE = (
-    np.array([0.0, 0.0, 1.0]),
-    np.array([0.0, 0.0, -1.0]),
-)  # bending directions of knee and elbow in T-pose
+LEG_POLE, ARM_POLE = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])  # bends of knee and elbow in T-pose
 
 
 # Smooth functions of time

@@ -79,9 +79,8 @@ def read_run_facts(run: Run, running: bool = False) -> RunFacts:
     started = _parse_time(manifest.get("started"))
     ended = _parse_time(failure.get("when") or finished) or max((one.time for one in log), default=started)
     evaluations, deployed = run.configured_evaluations, run.find_shown_deployment(config)
-    results = flatten(
-        add_solver_names(replace_with_deployed_times(run.results), evaluations.combined_solvers)
-    )
+    named = add_solver_names(replace_with_deployed_times(run.results), evaluations.combined_solvers)
+    results = flatten(named)
     step = max((record.step for record in log), default=0)
     git = manifest.get("git") or {}
     origin = {name: manifest.get(name) for name in ORIGIN}

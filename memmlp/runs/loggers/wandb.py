@@ -27,9 +27,7 @@ class WandBSettings(Settings):
     """Writes runs as W&B offline runs to outputs/wandb (needs pip install 'memmlp[wandb]')."""
 
     # the project that `wandb sync` uploads to
-    project: str = setting(
-        matching(r"[^/\\#?%:\n]{1,128}", "text without / \\ # ? % : and line breaks"), "memmlp"
-    )
+    project: str = setting(matching(r"[^/\\#?%:\n]{1,128}", "text without / \\ # ? % : or newline"), "memmlp")
 
 
 @dataclass(frozen=True)

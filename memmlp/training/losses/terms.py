@@ -104,9 +104,8 @@ class Comparison:
 
     def global_rotation(self, error: Error) -> Tensor:
         """Return the error of all joints' global 6D rotations."""
-        return error(
-            matrix_to_sixd(self.predicted.global_pose[0]) - matrix_to_sixd(self.truth.global_pose[0])
-        )
+        predicted, true = (matrix_to_sixd(one.global_pose[0]) for one in (self.predicted, self.truth))
+        return error(predicted - true)
 
     def angle(self, error: Error) -> Tensor:
         """Return the mean angle between predicted and true global rotations, in radians."""
