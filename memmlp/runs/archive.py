@@ -141,4 +141,4 @@ def _check_unpacked_run(run: Run, path: Path) -> None:
     if not records.read(run.marker, records.Marker).get("artifacts"):
         raise InputError(f"{path}: {run.marker.name} must contain the digests of the run's artifacts")
     if changed := run.verify():
-        raise InputError(f"{path}: must contain an unchanged run; missing or changed: {', '.join(changed)}")
+        raise InputError(f"{path}: must be an unchanged run; missing or changed files: {', '.join(changed)}")
