@@ -30,7 +30,7 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
     "--out",
     required=True,
     type=HomePath(dir_okay=False),
-    help="File to write: a figure (.png) or a film (.gif, .mp4).",
+    help="File to write: a figure (.svg, .png) or a film (.gif, .mp4).",
 )
 @click.option(
     "--label",
