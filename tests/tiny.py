@@ -95,7 +95,7 @@ def model(
 BASELINES: dict[str, dict[str, Any]] = {
     "agrol_mlp": dict(frames=7, width=16, depth=2),
     "agrol_diffusion": dict(
-        frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
+        frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0, sampler="ddim"
     ),
     "bodiffusion": dict(
         frames=7, width=48, depth=2, heads=3, diffusion_steps=50, sampling_steps=3, noise_seed=0,

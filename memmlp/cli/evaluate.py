@@ -1,4 +1,4 @@
-"""`memmlp eval`: the metrics of a finished run, measured if necessary."""
+"""`memmlp eval` and `memmlp import-weights`: the metrics of networks that are not trained here and now."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import click
 
 from memmlp.cli.options import PATH, check_runs_exist, device_option, outputs_option, plugins_option
 from memmlp.common.errors import InputError
+from memmlp.common.text_formats import make_override
 
 
 @click.command("eval")
@@ -77,3 +78,33 @@ def evaluate(
     if save_predictions is not None:
         write_predictions(experiment.evaluation, opened.network(), opened.test, save_predictions)
         click.echo(f"predictions of {len(opened.test.names)} clips in {save_predictions}")
+
+
+@click.command("import-weights")
+@click.argument("model")
+@click.argument("checkpoint", type=PATH)
+@click.argument("overrides", nargs=-1)
+@click.option("--mean", type=PATH, help="File with the mean of the rotations, if the network needs it.")
+@click.option("--std", type=PATH, help="File with the standard deviation of the rotations; with --mean.")
+@plugins_option
+@outputs_option
+def import_weights(
+    model: str,
+    checkpoint: Path,
+    overrides: tuple[str, ...],
+    mean: Path | None,
+    std: Path | None,
+    outputs: Path,
+) -> None:
+    """Make a finished run from weights that a network's authors publish.
+
+    MODEL is the network, such as avatar_poser, and CHECKPOINT the authors' file. OVERRIDES are those of
+    memmlp train, such as data=amass_s1. The run is evaluated, exported and timed.
+    """
+    if (mean is None) != (std is None):
+        raise InputError("--mean: must be given together with --std")
+    from memmlp.cli.train_summary import show
+    from memmlp.config.open_run import import_weights as run_import
+
+    words = [*overrides, make_override("paths.outputs", str(outputs.absolute()))]
+    show(run_import(model, checkpoint, words, [mean, std] if mean and std else []))

@@ -44,6 +44,7 @@ COMMANDS = {
     "mlflow": Command("loggers", "mlflow", "Open MLflow's page of the runs."),
     "ui": Command("ui", "ui", "Show runs, sweeps and searches on a local web page, live."),
     "eval": Command("evaluate", "evaluate", "Show metrics and write predictions of a finished run."),
+    "import-weights": Command("evaluate", "import_weights", "Make a run from weights that authors publish."),
     "predict": Command("predict", "predict", "Write a network's predictions for clips as BVH, glTF or npz."),
     "render": Command("render", "render", "Draw runs beside the ground truth as figures or films."),
     "live": Command("live", "live", "Show a network live on a local page, driven by a clip or trackers."),

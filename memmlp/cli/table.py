@@ -68,6 +68,11 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     is_flag=True,
     help="Show the number of seeds needed to detect the paper's effects with this data.",
 )
+@click.option(
+    "--official",
+    is_flag=True,
+    help="Show the published values, those of the authors' weights (memmlp import-weights) and those here.",
+)
 @config_dir_option
 @plugins_option
 @outputs_option
@@ -82,6 +87,7 @@ def table(
     together: tuple[str, ...],
     untrained: bool,
     seeds_needed: bool,
+    official: bool,
     outputs: Path,
 ) -> None:
     """Show the table of a sweep.
@@ -101,6 +107,9 @@ def table(
         gc.enable()
     if seeds_needed:
         print_needed_seeds(results, SHOWN_MODES[mode])
+        return
+    if official:
+        print_official_values(results, outputs, SHOWN_MODES[mode])
         return
     tables = [one.table for one in results]
     if form is None and out is None:
@@ -124,6 +133,18 @@ def print_needed_seeds(tables: Sequence[SweepTable], modes: Sequence[str]) -> No
             numbers = f"{row.paper:+.2f}", f"{row.measured:+.2f}", str(row.seeds)
             rows.append((*row.key, *numbers, str(row.needed or "no number is enough")))
         click.echo("\n".join([make_caption(one.table), *align_columns(rows, left=3), ""]))
+
+
+def print_official_values(tables: Sequence[SweepTable], outputs: Path, modes: Sequence[str]) -> None:
+    """Print published values, values of imported weights and values of trainings, for each sweep."""
+    from memmlp.report.tables.build_table import find_imported_runs, list_official_values
+    from memmlp.report.tables.table_text import make_caption
+
+    imported = find_imported_runs(outputs)
+    for one in tables:
+        head = ("variant", "weights", "mode", *one.sweep.metrics)
+        rows = list_official_values(one.sweep, one.runs, imported, modes)
+        click.echo("\n".join([make_caption(one.table), *align_columns([head, *rows], left=3), ""]))
 
 
 class TableSelection(NamedTuple):

@@ -57,7 +57,7 @@ from memmlp.training.devices import choose_device
 from memmlp.training.losses import Loss, MotionLoss, Term
 from memmlp.training.optim import Optim, make_vqvae_optim
 from memmlp.training.run_stages import Experiment
-from memmlp.training.train_network import NetworkTraining, Training, VQVAETraining
+from memmlp.training.train_network import NetworkTraining, Training, VQVAETraining, WeightsImport
 from memmlp.training.train_refiner import RefinerTraining
 
 
@@ -66,7 +66,7 @@ def build_experiment(cfg: DictConfig, remote: bool = False) -> Experiment:
     config's device may be missing here. Raises InputError if the device, or the code of a custom component,
     is missing."""
     unrefined = None
-    if cfg.refiner is not None:
+    if cfg.refiner is not None and not cfg.imported_weights:
         bare = cfg.copy()
         bare.refiner, bare.force, bare.save_predictions = None, False, None
         unrefined = build_experiment(bare, remote)
@@ -95,8 +95,9 @@ def build_experiment(cfg: DictConfig, remote: bool = False) -> Experiment:
 
 def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Training, ...]:
     """Build the trainings of the prerequisite runs that a checked config (also given as plain dictionaries)
-    needs, in order; none for a refiner, which needs only the run of its network."""
-    if cfg.refiner is not None:
+    needs, in order; none for a refiner, which needs only the run of its network,
+    or imported weights."""
+    if cfg.refiner is not None or cfg.imported_weights:
         return ()
     if cfg.prerequisite is not None:
         training = build_training(cfg, {})
@@ -112,10 +113,11 @@ def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTr
     """Build the training of a checked config's refiner, or of its network if it has no refiner."""
     common = {"seed": cfg.seed, "optim": build(cfg, "optim"), "drawn_by": cfg.data.drawn_by}
     common |= {"shares": read_source_weights(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
-    if cfg.refiner is not None:
+    if cfg.refiner is not None and not cfg.imported_weights:
         refiner = _make_settings(cfg, "refiner")
         return RefinerTraining(refiner=refiner, **common | {"optim": common["optim"].with_lr(refiner.lr)})
-    return NetworkTraining(loss=build_loss(cfg), rollout=build(cfg, "rollout"), **common)
+    kind = WeightsImport if cfg.imported_weights else NetworkTraining
+    return kind(loss=build_loss(cfg), rollout=build(cfg, "rollout"), **common)
 
 
 def build_untrained(overrides: Sequence[str]) -> MotionModel:
@@ -170,6 +172,7 @@ def build_architecture(cfg: DictConfig) -> Architecture:
     return Architecture(
         coordinates=coordinates,
         normalize=cfg.normalizer.z_scores,
+        raw_inputs=bool(cfg.normalizer.get("raw_inputs")),
         vqvae=vqvae,
         network=build_network,
         uses_codes=codes == "frozen",
@@ -308,6 +311,7 @@ def make_readable_name(kind: str, config: Mapping[str, Any]) -> str:
     slots, and values of other keys, that differ from the defaults. Data, paths, loggers and keys without an
     effect on the results are omitted."""
     words = [] if kind == NETWORK else [describe_kind(kind)]
+    words += ["published weights"] if config.get("imported_weights") else []
     try:
         words += _list_differences(config)
     except (HydraException, OmegaConfBaseException):  # the run must not fail because of its name
@@ -341,7 +345,11 @@ def _list_differences(config: Mapping[str, Any]) -> Iterator[str]:
     counting = select_training_config(config) | select_training_config(default)  # a key may count in one only
     for key in counting:
         group, _, last = key.partition(".")
-        if group in (*custom, "profile") or last == "name" or key in ("seed", "vqvae.seed"):
+        if (
+            group in (*custom, "profile")
+            or last == "name"
+            or key in ("seed", "vqvae.seed", "imported_weights")
+        ):
             continue
         if key in own and own[key] != usual.get(key):
             yield f"{key}={format_value(own[key])}"

@@ -1,26 +1,38 @@
-"""Opens finished runs with their experiments and data, for evaluation, export and live use."""
+"""Opens finished runs with their experiments and data, and makes runs from published weights."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
+from memmlp.common.components import find_component, list_component_names
 from memmlp.common.errors import InputError
-from memmlp.common.overrides import parse_overrides
+from memmlp.common.files import file_digest
+from memmlp.common.overrides import format_value, parse_overrides
+from memmlp.common.text_formats import make_override
 from memmlp.config.build import build_experiment, load_config
-from memmlp.motion.body import load_rest_joints
+from memmlp.config.compose import compose_config
+from memmlp.motion.body import ROTATION, load_rest_joints
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import PreparedMotion, ShippedMotion
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks import checkpoint
 from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.settings import Release
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, select_training_config
 from memmlp.runs.lookup import find_run, find_shipped_clip, get_shipped_name
 from memmlp.runs.run import Run
 from memmlp.training.devices import choose_device
-from memmlp.training.run_stages import Experiment
+from memmlp.training.request import Outcome
+from memmlp.training.run_stages import Experiment, run_experiment
+from memmlp.training.train_network import PublishedWeights, WeightsImport
 
 EFFECTIVE_GROUPS = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
 """The groups with an effect on the use of a finished run. The keys in INFERENCE also have an effect."""
@@ -92,6 +104,65 @@ def build_run_experiment(
 def load_network(run: Run, experiment: Experiment) -> MotionModel:
     """Return the trained network of a run, in evaluation mode, on the experiment's device."""
     return experiment.architecture.load(run.weights()).to(experiment.device)
+
+
+def import_weights(
+    name: str, path: Path, overrides: Sequence[str], statistics: Sequence[Path] = ()
+) -> Outcome:
+    """Make a finished run from a checkpoint that a network's authors publish, and evaluate and deploy it.
+
+    The checkpoint's shapes and the network's Release set sizes and options; the overrides win.
+
+    Args:
+        name: the network's option of `model`.
+        path: the checkpoint.
+        overrides: overrides KEY=VALUE, such as the data.
+        statistics: the files with mean and standard deviation of the rotations, for a network with z-scores;
+            by default, those of the training clips are used.
+
+    Raises:
+        InputError: if the checkpoint cannot be read, or does not fit the network and the overrides.
+    """
+    network = find_component("model", name)
+    if (release := getattr(network.settings, "release", None)) is None:
+        known = [one for one in list_component_names("model") if _get_release(one)]
+        raise InputError(f"{name}: has no published weights; must be {' or '.join(known)}")
+    kind: type[MotionModel] = network.kind
+    tensors = kind.adapt_published(checkpoint.read_published(path))
+    vectors = checkpoint.read_published_statistics(statistics, ROTATION.stop) if statistics else None
+    digest = hashlib.sha256("".join(map(file_digest, (path, *statistics))).encode()).hexdigest()
+    with _naming_checkpoint(path):
+        sizes = checkpoint.find_published_sizes(tensors, release)
+    values = {"profile": "paper", **release.config, **sizes}
+    words = [f"model={name}", *(f"{key}={format_value(value)}" for key, value in values.items())]
+    cfg = compose_config([*words, *overrides, make_override("imported_weights", digest[:16])])
+    if statistics and not cfg.normalizer.z_scores:
+        raise InputError(f"--mean: must be left out with model={name}, which does not normalise the motion")
+    experiment = build_experiment(cfg)
+    architecture = experiment.architecture
+    model = architecture.build(
+        Normalizer.from_coordinates(architecture.coordinates, torch.zeros(22, 3)), None
+    )
+    with _naming_checkpoint(path):
+        renamed = checkpoint.rename_published(tensors, release, dict(model.named_parameters()))
+    origin = {"model": name, "file": path.name, "sha256": file_digest(path), "source": release.source}
+    training = experiment.training
+    assert isinstance(training, WeightsImport)
+    training = replace(training, published=PublishedWeights(renamed, vectors, origin))
+    return run_experiment(replace(experiment, training=training))
+
+
+def _get_release(name: str) -> Release | None:
+    return getattr(find_component("model", name).settings, "release", None)
+
+
+@contextmanager
+def _naming_checkpoint(path: Path) -> Iterator[None]:
+    """Put the file's name before errors of the context."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def find_clip(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:

@@ -21,6 +21,7 @@ from memmlp.common.settings import (
     existing_clip_folders,
     fraction,
     group,
+    matching,
     one_of,
     positive,
     seed,
@@ -194,6 +195,8 @@ class NormalizerConfig:
     coordinates: str = setting(_coordinates(), "heading", literal="world")
     # true: normalise by mean and deviation of the training clips (docs/readings.md, no. 20)
     z_scores: bool = setting(None, True, literal=False)
+    # true: inputs are not normalised, only the motion; null or false: both are
+    raw_inputs: bool | None = setting(None, None)
 
 
 @dataclass
@@ -272,6 +275,8 @@ class Config:
     force: bool = setting()
     plugins: list[str] = setting(each(empty=True), [])
     save_predictions: str | None = setting()
+    # the start of the SHA-256 of published weights; only memmlp import-weights sets it
+    imported_weights: str | None = setting(matching(r"[0-9a-f]{16}", "16 hex digits, or null"), None)
     paths: PathsConfig = group(PathsConfig)
     profile: ProfileConfig = group(ProfileConfig)
     data: DataConfig = group(DataConfig)

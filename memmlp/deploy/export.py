@@ -173,7 +173,8 @@ SIMPLER = onnx_ir.passes.Sequential(
 
 def make_metadata(model: MotionModel | StreamingGraph, run_id: str) -> dict[str, str]:
     """Return the metadata that a program needs to run the exported file."""
-    return {
+    origin = {"weights": model.origin} if model.origin else {}
+    return origin | {
         "joints": json.dumps(JOINTS),
         "parents": json.dumps(PARENTS),
         "rest": json.dumps(model.normalizer.rest.tolist()),

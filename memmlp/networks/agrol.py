@@ -6,6 +6,8 @@ paper's sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of `mem
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -14,18 +16,26 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, setting, tuned
+from memmlp.common.settings import at_least, one_of, setting, tuned
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.diffusion import Diffusion, TimeEmbedding
+from memmlp.networks.diffusion import Diffusion, PosteriorDiffusion
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.motion_model import (
     State,
     TrainingOutputs,
     WindowModel,
 )
-from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.streaming import StemGraph
+from memmlp.networks.settings import NetworkSettings, Release
+from memmlp.networks.streaming import StemGraph, make_linear
+
+BLOCK_NAMES = {
+    "blocks.*.time_norm.*": "motion_mlp.mlps.*.norm0.*",
+    "blocks.*.time_mix.*": "motion_mlp.mlps.*.fc0.*",
+    "blocks.*.norm.*": "motion_mlp.mlps.*.norm1.*",
+    "blocks.*.linear.*": "motion_mlp.mlps.*.fc1.*",
+}
+"""The names of the blocks' parts in the released code, for a Release."""
 
 
 class AGRoLMLPGraph(StemGraph):
@@ -66,6 +76,15 @@ class AGRoLMLPSettings(NetworkSettings):
 
     defaults: ClassVar = {"loss": "agrol"}
     recipe: ClassVar = tuned(8.0e-3)
+    release: ClassVar = Release(
+        source="facebookresearch/AGRoL 13a2b63",
+        names={"stem.*": "input_fc.*", **BLOCK_NAMES, "head.*": "output_fc.*"},
+        sizes={
+            "model.frames": ("motion_mlp.mlps.0.fc0.weight", 0),
+            "model.width": ("input_fc.weight", 0),
+            "model.depth": "motion_mlp.mlps.*.fc0.weight",
+        },
+    )
 
 
 class AGRoLMLP(WindowModel):
@@ -113,34 +132,40 @@ class AGRoLDiffusionGraph(StemGraph):
     Each block's shift for the diffusion time is the same at every step of a stream, so it is computed once.
     """
 
+    float32_modules = ("inputs", "noisy", "model.head")
     model: AGRoLDiffusion
     blocks: list[MLPBlock]
     shifts: Tensor
 
     def build(self, model: Any) -> None:
-        self.model, self.width = model, model.stem.out_features
+        self.model, self.width = model, model.merge.out_features
         self.blocks = cast(list[MLPBlock], list(model.blocks))
-        embedding = F.silu(model.time(torch.tensor(model.diffusion.times).to(model.noise)))
+        of_inputs, of_motion = model.merge.weight.chunk(2, 1)
+        bias = model.merge.bias + of_inputs @ model.sparse.bias + of_motion @ model.motion.bias
+        self.inputs = make_linear(of_inputs @ model.sparse.weight, bias)
+        self.noisy = make_linear(of_motion @ model.motion.weight)
+        embedding = F.silu(model.embed_time(torch.tensor(model.diffusion.times)))
         timed = cast(list[TimedBlock], self.blocks)
         self.register_buffer("shifts", torch.stack([block.time(embedding) for block in timed], 1))
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
-        """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
+        """Return the part of the merged input (1, d) that comes from a frame's inputs (1, 54).
 
         The part that comes from the noisy motion is added at each denoiser call.
         """
-        return F.linear(encoded, self.model.stem.weight[:, ROTATION.stop :], self.model.stem.bias)
+        return self.inputs(encoded)
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
-        """Sample by DDIM; the denoiser's last call computes only the newest frame (1, 132)."""
-        diffusion, noisy = self.model.diffusion, self.model.noise
+        """Draw a sample; the denoiser's last call computes only the newest frame (1, 132)."""
+        diffusion, (noisy, *further) = self.model.diffusion, self.model.noise
         for index in range(len(diffusion.times) - 1):
-            noisy = diffusion.step(noisy, self._denoise_newest(noisy, window, index, self.frames), index)
+            clean = self._denoise_newest(noisy, window, index, self.frames)
+            noisy = diffusion.step(noisy, clean, index, further[index] if further else None)
         return self._denoise_newest(noisy, window, len(diffusion.times) - 1, 1)
 
     def _denoise_newest(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Tensor:
         """Predict the newest `count` clean rotations at sampling step `index` from noisy ones (T, 132)."""
-        h = window + F.linear(noisy, self.model.stem.weight[:, : ROTATION.stop])
+        h = window + self.noisy(noisy)
         *earlier, last = zip(self.blocks, self.shifts[index], strict=True)
         for block, shift in earlier:
             h = block.compute_newest(h + shift, self.frames)
@@ -148,33 +173,62 @@ class AGRoLDiffusionGraph(StemGraph):
         return self.model.head(block.compute_newest(h + shift, count))
 
 
-@component("model", "agrol_diffusion", builds="AGRoLDiffusion")
+@component("model", "agrol_diffusion", version=2, builds="AGRoLDiffusion")
 @dataclass
 class AGRoLDiffusionSettings(AGRoLMLPSettings):
-    """AGRoL's diffusion model (Du et al. 2023), which generates a window's rotations from noise by DDIM.
+    """AGRoL's diffusion model (Du et al. 2023), which generates a window's rotations from noise.
 
-    Loss, depth, noise schedule and features follow its released code, which normalises the motion but not the
-    inputs. The training settings differ: AdamW instead of Adam, final_lr, and the profile's values.
+    Layers, loss, depth, noise schedule and features follow its released code, which normalises the motion but
+    not the inputs. The training settings differ: AdamW instead of Adam, final_lr, and the profile's values.
     """
 
-    # d, the width of the hidden state
+    # d, the width of the hidden state; must be even
     width: int = setting(at_least(2), tiny=16, small=128, paper=512, width_fraction=1)
     diffusion_steps: int = setting(at_least(1), 1000)  # number of steps in the cosine noise schedule
-    sampling_steps: int = setting(at_least(1), 5)  # number of denoiser calls per window (DDIM)
+    sampling_steps: int = setting(at_least(1), 5)  # number of denoiser calls per window
     noise_seed: int = setting(at_least(0), 0)  # seed of the sampling noise, equal for all windows
+    # ddim: no noise in the steps, as in the paper; posterior: with noise and at times 0, 200, ..., as in the
+    # released code
+    sampler: str = setting(one_of("ddim", "posterior"), "ddim")
 
-    recipe: ClassVar = {"normalizer.z_scores": True}
+    recipe: ClassVar = {"normalizer.z_scores": True, "normalizer.raw_inputs": True}
+    release: ClassVar = Release(
+        source="facebookresearch/AGRoL 13a2b63",
+        names={
+            "motion.*": "input_process.*",
+            "sparse.*": "sparse_process.*",
+            "merge.*": "mlp.motion_mlp.mlps.0.conct.*",
+            **{ours: f"mlp.{theirs}" for ours, theirs in BLOCK_NAMES.items()},
+            "blocks.*.time.*": "mlp.motion_mlp.mlps.*.emb_fc.*",
+            "head.*": "output_process.*",
+        },
+        sizes={
+            "model.frames": ("mlp.motion_mlp.mlps.0.fc0.weight", 0),
+            "model.width": ("input_process.weight", 0),
+            "model.depth": "mlp.motion_mlp.mlps.*.fc0.weight",
+        },
+        unused=("embed_timestep.pe",),
+        config={"model.sampler": "posterior"},
+    )
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        yield from super().problems(config)
+        model = config["model"]
+        if model["width"] % 2:
+            yield f"model.width={model['width']}: must be even with model=agrol_diffusion"
+        steps, calls = model["diffusion_steps"], model["sampling_steps"]
+        if model["sampler"] == "posterior" and len(range(0, steps, -(-steps // calls))) != calls:
+            yield f"model.sampling_steps={calls}: must divide {steps} steps with model.sampler=posterior"
 
 
 class AGRoLDiffusion(WindowModel):
     """A denoiser of rotations, conditioned on the window's inputs, that predicts the clean rotations.
 
     It has 7,480,436 parameters at the paper's sizes (7.48 M in Table 16): the MLP's blocks and head
-    (3,707,508), a linear layer of each block for the time's embedding (12 x 262,656), the embedding's own two
-    linear layers (525,312), and a stem for concatenated noisy motion and inputs (95,744). The paper says that
-    the embedding enters every block. The two layers before the blocks follow from the paper's parameter
-    count. The released code has the same number of parameters in linear layers for motion and inputs instead
-    (docs/readings.md).
+    (3,707,508), a linear layer of each block for the time's embedding (12 x 262,656), a linear layer each for
+    noisy motion (68,096) and inputs (28,160), and one that merges both (524,800).
 
     Sampling always starts from the same noise, drawn with `noise_seed`. Its result therefore depends only on
     the inputs, in torch and in ONNX, and consecutive windows of a stream share their noise.
@@ -185,15 +239,25 @@ class AGRoLDiffusion(WindowModel):
 
     def __init__(self, normalizer: Normalizer, settings: AGRoLDiffusionSettings):
         super().__init__(normalizer, settings.frames)
-        self.diffusion = Diffusion(settings.diffusion_steps, settings.sampling_steps)
-        self.time = TimeEmbedding(settings.width)
-        self.stem = nn.Linear(ROTATION.stop + SPARSE_DIM, settings.width)
+        sampler = {"ddim": Diffusion, "posterior": PosteriorDiffusion}[settings.sampler]
+        self.diffusion = sampler(settings.diffusion_steps, settings.sampling_steps)
+        self.motion = nn.Linear(ROTATION.stop, settings.width)
+        self.sparse = nn.Linear(SPARSE_DIM, settings.width)
+        self.merge = nn.Linear(2 * settings.width, settings.width)
         self.blocks = nn.ModuleList(
             TimedBlock(settings.width, settings.frames) for _ in range(settings.depth)
         )
         self.head = nn.Linear(settings.width, ROTATION.stop)
         draw = torch.Generator().manual_seed(settings.noise_seed)
-        self.register_buffer("noise", torch.randn(settings.frames, ROTATION.stop, generator=draw))
+        shape = self.diffusion.noise_draws, settings.frames, ROTATION.stop
+        self.register_buffer("noise", torch.randn(shape, generator=draw))
+
+    def embed_time(self, time: Tensor) -> Tensor:
+        """Return sines and cosines of diffusion times (n,), alternating (n, d) (Vaswani et al. 2017)."""
+        width = self.merge.out_features
+        rates = torch.exp(torch.arange(0, width, 2) * (-math.log(10_000) / width)).to(time.device)
+        angles = time[:, None] * rates
+        return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2).to(self.noise.dtype)
 
     def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Tensor:
         """Predict the clean rotations (B, T, 132).
@@ -203,16 +267,20 @@ class AGRoLDiffusion(WindowModel):
             time: diffusion times (B,).
             encoded: inputs (B, T, 54) in network space.
         """
-        embedding = self.time(time)
-        h = self.stem(torch.cat([noisy, encoded], -1))
+        embedding = self.embed_time(time)
+        h = self.merge(torch.cat([self.sparse(encoded), self.motion(noisy)], -1))
         for block in self.blocks:
             h = block(h, embedding)
         return self.head(h)
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
-        noise = self.noise.expand(len(encoded), -1, -1)
-        return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)
+        first, *further = self.noise
+        return self.diffusion.sample(
+            lambda noisy, time: self.denoise(noisy, time, encoded),
+            first.expand(len(encoded), -1, -1),
+            further,
+        )
 
     def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Add noise to the truth, and denoise it in one denoiser call; see MotionModel.

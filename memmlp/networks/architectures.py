@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Coordinates
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.manifest import Manifest
@@ -26,6 +27,7 @@ class Architecture:
     Attributes:
         coordinates: the coordinate system of the network's inputs and outputs.
         normalize: whether features are normalised to z-scores.
+        raw_inputs: whether inputs are excluded from the normalisation.
         vqvae: makes a VQ-VAE with random weights.
         network: makes the network with random weights, given its normalizer and the frozen VQ-VAE or None.
         uses_codes: whether the network needs a frozen VQ-VAE.
@@ -41,6 +43,7 @@ class Architecture:
     uses_codes: bool = False
     trained_parts: tuple[str, ...] | None = None
     refiner: SAGERefinerSettings | None = None
+    raw_inputs: bool = False
 
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MotionModel:
         """Build the network with random weights.
@@ -80,7 +83,10 @@ class Architecture:
         """Make the normalizer; with `normalize`, it uses the statistics of the training frames (F, 252)."""
         rest = torch.as_tensor(np.asarray(manifest.rest), dtype=torch.float32)
         if self.normalize:
-            return Normalizer.fit(self.coordinates, rest, frames)
+            normalizer = Normalizer.fit(self.coordinates, rest, frames)
+            if self.raw_inputs:
+                normalizer.mean[:SPARSE_DIM], normalizer.std[:SPARSE_DIM] = 0, 1
+            return normalizer
         return Normalizer.from_coordinates(self.coordinates, rest)
 
     def load(self, weights: Path) -> MotionModel:
@@ -89,8 +95,9 @@ class Architecture:
         Raises:
             InputError: if the file is damaged.
         """
-        tensors, _ = checkpoint.read(weights)
+        tensors, values = checkpoint.read(weights)
         codes = self.vqvae() if self.uses_codes else None
         model = self.build(Normalizer.from_coordinates(self.coordinates, torch.zeros(22, 3)), codes)
         checkpoint.load_module("model", model, tensors)
+        model.origin = values.get("origin", "")
         return model.eval()

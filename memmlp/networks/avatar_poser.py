@@ -9,7 +9,7 @@ mean shape.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, cast
 
 import torch
@@ -22,7 +22,7 @@ from memmlp.motion.body import N_JOINTS, SPARSE_DIM, SPARSE_POSITION, TRACKED
 from memmlp.motion.network_coordinates import HeadRelative
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import NewestFrameModel, StreamingGraph
-from memmlp.networks.settings import NetworkSettings
+from memmlp.networks.settings import NetworkSettings, Release, name_encoder
 from memmlp.networks.streaming import StemGraph
 from memmlp.networks.transformer import EncoderLayer, encode_newest_frame, initialize_weights, make_encoder
 
@@ -86,6 +86,21 @@ class AvatarPoserSettings(NetworkSettings):
     learns_newest_frame: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "avatar_poser"}
     recipe: ClassVar = tuned(4.0e-3)
+    release: ClassVar = Release(
+        source="eth-siplab/AvatarPoser 0f97cb2",
+        names={
+            "embedding.*": "linear_embedding.*",
+            **name_encoder("layers.*", "transformer_encoder.layers.*"),
+            "orientation.*.*": "stabilizer.*.*",
+            "rotation.*.*": "joint_rotation_decoder.*.*",
+        },
+        sizes={
+            "model.width": ("linear_embedding.weight", 0),
+            "model.depth": "transformer_encoder.layers.*.linear1.weight",
+            "model.feedforward": ("transformer_encoder.layers.0.linear1.weight", 0),
+        },
+        unused=("body_model.**",),
+    )
 
 
 class AvatarPoser(NewestFrameModel):
@@ -172,14 +187,19 @@ class EgoPoserGraph(StemGraph):
 class EgoPoserSettings(AvatarPoserSettings):
     """EgoPoser (Jiang et al. 2024): AvatarPoser's encoder over a fast and a slow view of a longer window.
 
-    Loss and features follow its released code. The hands' positions follow its paper instead
-    (docs/readings.md). The training settings are the same as for AvatarPoser.
+    Loss and features follow its released code. The training settings are the same as for AvatarPoser.
     """
 
     # T, the number of frames in a window; the encoder sees half as many
     frames: int = setting(at_least(2), tiny=20, small=80, paper=80)
 
     defaults: ClassVar = {"loss": "ego_poser"}
+    release: ClassVar = replace(
+        AvatarPoserSettings.release,
+        source="eth-siplab/EgoPoser 1acf2fd",
+        names=AvatarPoserSettings.release.names | {"orientation.*.*": "global_orientation_decoder.*.*"},
+        unused=("linear_embedding_fast.*", "shape_decoder.**"),
+    )
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
@@ -199,7 +219,7 @@ class EgoPoser(AvatarPoser):
     It has 4,126,340 parameters at the paper's sizes (T = 80, otherwise AvatarPoser's); the released code has
     an unused layer of 7,808 parameters. Positions are relative to the floor point below the head of the same
     frame. Their movement since the window's first frame is appended to each frame's inputs; for the head it
-    is 0. The released code uses world positions and movements of the hands (docs/readings.md).
+    is 0.
     """
 
     graph = EgoPoserGraph

@@ -20,7 +20,7 @@ from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import AncestralDiffusion, DenoiserOutput, TimeEmbedding
 from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
-from memmlp.networks.settings import NetworkSettings
+from memmlp.networks.settings import NetworkSettings, Release
 from memmlp.networks.streaming import StemGraph, make_linear
 from memmlp.networks.transformer import DiTBlock
 
@@ -118,6 +118,31 @@ class BoDiffusionSettings(NetworkSettings):
     # with weights of 1 it did not learn the motion (docs/results/recurrent_poser.md)
     kinematic: ClassVar[str] = (
         f"{NetworkSettings.kinematic} model.noise_weight=1000.0 model.bound_weight=1000.0"
+    )
+
+    release: ClassVar = Release(
+        source="BCV-Uniandes/BoDiffusion 0ffd1b8",
+        names={
+            "time.mlp.*.*": "embed_timestep.mlp.*.*",
+            "spread.*": "cond_emb.projections.*",
+            "stem.*": "input_process.poseEmbedding.*",
+            "places": "pos_embed",
+            "blocks.*.attention.query.*": "blocks.*.attn.qkv.*[0/3]",
+            "blocks.*.attention.key.*": "blocks.*.attn.qkv.*[1/3]",
+            "blocks.*.attention.value.*": "blocks.*.attn.qkv.*[2/3]",
+            "blocks.*.attention.out.*": "blocks.*.attn.proj.*",
+            "blocks.*.mlp.0.*": "blocks.*.mlp.fc1.*",
+            "blocks.*.mlp.2.*": "blocks.*.mlp.fc2.*",
+            "blocks.*.modulation.*": "blocks.*.adaLN_modulation.1.*",
+            "head.*": "out.poseFinal.*",
+            "joint_head.*": "out.featsFinal.*",
+        },
+        sizes={
+            "model.frames": ("pos_embed", 1),
+            "model.width": ("pos_embed", 2),
+            "model.depth": "blocks.*.attn.qkv.weight",
+        },
+        config={"model.offline": True, "evaluation.modes": ["window"], "export.graph": "off"},
     )
 
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -86,27 +86,34 @@ class Diffusion(NoiseProcess):
     def __init__(self, steps: int, sampling_steps: int):
         super().__init__(make_cosine_schedule(steps), sampling_steps)
 
-    def sample(self, denoise: Denoise, noise: Tensor) -> Tensor:
+    @property
+    def noise_draws(self) -> int:
+        """The number of noise draws for a sample: one, for its start."""
+        return 1
+
+    def sample(self, denoise: Denoise, noise: Tensor, further: Sequence[Tensor] = ()) -> Tensor:
         """Sample the clean signal (B, ...) by deterministic DDIM (Song et al. 2021, Eq. 12, eta = 0).
 
         Args:
             denoise: maps a noisy signal (B, ...) and times (B,) to an estimate of the clean signal.
             noise: the noise (B, ...) to start from.
+            further: the noise of further draws (`noise_draws`), which broadcasts to the signal.
         """
         x = noise
         for index, time in enumerate(self.times):
             clean = denoise(x, torch.full((len(x),), time, device=x.device))
             if index + 1 < len(self.times):
-                x = self.step(x, clean, index)
+                x = self.step(x, clean, index, further[index] if further else None)
         return clean
 
-    def step(self, x: Tensor, clean: Tensor, index: int) -> Tensor:
+    def step(self, x: Tensor, clean: Tensor, index: int, noise: Tensor | None = None) -> Tensor:
         """Take one sampling step.
 
         Args:
             x: the noisy signal (B, ...) at sampling step `index`.
             clean: the estimated clean signal for `x`.
             index: number of the sampling step, from 0.
+            noise: the noise that the step adds; DDIM does not add noise.
 
         Returns:
             The noisy signal (B, ...) at sampling step `index` + 1.
@@ -114,6 +121,33 @@ class Diffusion(NoiseProcess):
         here, there = (self.signal[time] for time in self.times[index : index + 2])
         direction = (x - here.sqrt() * clean) / (1 - here).sqrt()
         return there.sqrt() * clean + (1 - there).sqrt() * direction
+
+
+class PosteriorDiffusion(Diffusion):
+    """Diffusion with a cosine schedule, sampled as in AGRoL's released code.
+
+    Each step draws from the posterior with the smallest variance (Ho et al. 2020, Eq. 7), the last step takes
+    its mean. The sampling times are multiples of a stride and start below pure noise.
+    """
+
+    posterior: Tensor
+
+    def __init__(self, steps: int, sampling_steps: int):
+        super().__init__(steps, sampling_steps)
+        self.times = list(range(0, steps, math.ceil(steps / sampling_steps)))[::-1]
+        posterior = compute_posterior(make_cosine_schedule(steps)[self.times[::-1]]).flip(-1)
+        self.register_buffer("posterior", posterior.float(), persistent=False)
+
+    @property
+    def noise_draws(self) -> int:
+        """The number of noise draws for a sample: one for its start, one for each step except the last."""
+        return len(self.times)
+
+    def step(self, x: Tensor, clean: Tensor, index: int, noise: Tensor | None = None) -> Tensor:
+        """Take one sampling step; see Diffusion."""
+        first, second, log_variance, _ = self.posterior[:, index]
+        assert noise is not None
+        return first * clean + second * x + (log_variance / 2).exp() * noise
 
 
 SamplingStep = Callable[[Tensor, int], tuple[Tensor, Tensor]]

@@ -6,6 +6,7 @@ bodies here have the mean shape, so the predicted shape does not affect joint po
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,12 +30,13 @@ from memmlp.motion.body import (
 from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
-from memmlp.networks.settings import NetworkSettings
+from memmlp.networks.settings import NetworkSettings, Release, name_encoder
 from memmlp.networks.transformer import make_encoder
 
 HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors that there are none of
 TOKENS = len(TRACKED) + HANDS + OTHERS
 SHAPE = 16  # components of a body's shape
+RELEASED_ORDER = (0, 1, 2, 6, 7, 3, 4, 5)  # the place of each token in the released code
 
 # On a GPU cuDNN copies an LSTM's weights into one piece: at each call, since they are computed at each call.
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
@@ -182,6 +184,35 @@ class HMDPoserSettings(NetworkSettings):
 
     defaults: ClassVar = {"loss": "hmd_poser"}
     recipe: ClassVar = tuned(8.0e-3)
+    release: ClassVar = Release(
+        source="Pico-AI-Team/HMD-Poser 7c3470d",
+        names={
+            "trackers.0.parts.*.*": "backbone.head_linear_embeddings.*.0.*",
+            "trackers.1.parts.*.*": "backbone.lhand_linear_embeddings.*.0.*",
+            "trackers.2.parts.*.*": "backbone.rhand_linear_embeddings.*.0.*",
+            "hands.0.parts.*.*": "backbone.lhand_inhead_linear_embeddings.*.0.*",
+            "hands.1.parts.*.*": "backbone.rhand_inhead_linear_embeddings.*.0.*",
+            "others.0.parts.*.*": "backbone.lfoot_linear_embeddings.*.0.*",
+            "others.1.parts.*.*": "backbone.rfoot_linear_embeddings.*.0.*",
+            "others.2.parts.*.*": "backbone.pelvis_linear_embeddings.*.0.*",
+            "norm.*": "backbone.norm.*",
+            "blocks.*.over_time.*.directions.0": "backbone.time_encoder.*.*.weight_ih_l0_v",
+            "blocks.*.over_time.*.directions.1": "backbone.time_encoder.*.*.weight_hh_l0_v",
+            "blocks.*.over_time.*.gains.0": "backbone.time_encoder.*.*.weight_ih_l0_g",
+            "blocks.*.over_time.*.gains.1": "backbone.time_encoder.*.*.weight_hh_l0_g",
+            "blocks.*.over_time.*.biases.0": "backbone.time_encoder.*.*.bias_ih_l0",
+            "blocks.*.over_time.*.biases.1": "backbone.time_encoder.*.*.bias_hh_l0",
+            **name_encoder("blocks.*.layers.*", "backbone.spatial_encoder.*.layers.*"),
+            "pose.*.*": "pose_est.*.*",
+            "shape.*.*": "shape_est.*.*",
+        },
+        sizes={
+            "model.width": ("backbone.norm.weight", 0),
+            "model.depth": "backbone.time_encoder.*.0.bias_ih_l0",
+            "model.encoder_layers": "backbone.spatial_encoder.0.layers.*.linear1.weight",
+            "model.feedforward": ("backbone.spatial_encoder.0.layers.0.linear1.weight", 0),
+        },
+    )
 
 
 class HMDPoser(WindowlessModel):
@@ -213,6 +244,21 @@ class HMDPoser(WindowlessModel):
         return nn.Sequential(
             nn.Linear(TOKENS * self.width, self.width), nn.LeakyReLU(), nn.Linear(self.width, size)
         )
+
+    @classmethod
+    def adapt_published(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Reorder the tokens: the released code has those of absent sensors before the relative hands."""
+
+        def reorder(name: str) -> str:
+            found = re.fullmatch(r"(backbone\.time_encoder\.\d+\.)([0-7])(\..*)", name)
+            return f"{found[1]}{RELEASED_ORDER.index(int(found[2]))}{found[3]}" if found else name
+
+        moved = {reorder(name): tensor for name, tensor in tensors.items()}
+        for name in ("pose_est.0.weight", "shape_est.0.weight"):
+            if name in moved and moved[name].dim() == 2 and moved[name].shape[1] % TOKENS == 0:
+                columns = moved[name].unflatten(1, (TOKENS, -1))
+                moved[name] = columns[:, list(RELEASED_ORDER)].flatten(1)
+        return moved
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the initial state: zeros (B, 8 x depth, d)."""

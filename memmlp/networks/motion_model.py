@@ -44,6 +44,7 @@ class MotionModel(nn.Module):
     Attributes:
         branches: the learned quantities, out of "rotation" and "position". Without learned positions, forward
             kinematics gives them.
+        origin: the origin of imported weights; empty for trained weights.
         graph: the class of the streaming graph, or None. It is not inherited, since a subclass may compute
             something else.
         shift: number of frames from the end of the recalled past to the newest frame; 0 without a recalled
@@ -65,6 +66,7 @@ class MotionModel(nn.Module):
     frames_per_call: int = 1
     is_stream: bool = True
     takes_whole_clip: bool = False
+    origin: str = ""
     graph: ClassVar[type[StreamingGraph] | None] = None
 
     def __init__(self, normalizer: Normalizer, frames: int):
@@ -137,6 +139,11 @@ class MotionModel(nn.Module):
             true_frames: world frames [X | Theta] (B, T, 252) of the window.
         """
         return TrainingOutputs(*self.advance(sparse, state), {})
+
+    @classmethod
+    def adapt_published(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Rearrange the authors' tensors where names are not enough (`Release`); by default unchanged."""
+        return tensors
 
     def count_parameters(self) -> int:
         """Count the trainable parameters; tables show this number in millions.
@@ -261,6 +268,7 @@ class StreamingGraph(nn.Module):
         super().__init__()
         model = copy.deepcopy(model).eval().requires_grad_(False)
         self.frames, self.normalizer, self.branches = model.frames, model.normalizer, model.branches
+        self.origin = model.origin
         self.build(model)
         self.requires_grad_(False)
 

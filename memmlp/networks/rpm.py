@@ -20,7 +20,7 @@ from memmlp.common.settings import at_least, fraction, setting, tuned
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
-from memmlp.networks.settings import NetworkSettings
+from memmlp.networks.settings import NetworkSettings, Release, name_encoder
 from memmlp.networks.transformer import Attention, make_encoder
 
 FRESH_FRACTION = 0.25  # of the training windows begin as a live stream does, without a past
@@ -57,9 +57,32 @@ class RPMSettings(NetworkSettings):
     own_dropout: bool = setting(default=False)
     # number of frames to predict; RPM's paper uses 10 (reactive) or 20 (smooth)
     horizon: int = setting(at_least(1), 10)
+    # true: the first prediction of a frame is its tanh, as in the released code; null or false: unchanged
+    bounded_first: bool | None = setting(default=None)
 
     defaults: ClassVar = {"loss": "rpm"}
     recipe: ClassVar = {"normalizer.z_scores": True, **tuned(8.0e-3)}
+    release: ClassVar = Release(
+        source="facebookresearch/motion_rolling_prediction 64fe8f1",
+        names={
+            "motion.*": "input_process.poseEmbedding.*",
+            "sparse.*": "sparse_process.poseEmbedding.*",
+            "attention.query.*": "xatt.in_proj_*[0/3]",
+            "attention.key.*": "xatt.in_proj_*[1/3]",
+            "attention.value.*": "xatt.in_proj_*[2/3]",
+            "attention.out.*": "xatt.out_proj.*",
+            "norm.*": "xatt_norm.*",
+            **name_encoder("layers.*", "seqTransEncoder.layers.*"),
+            "head.*": "output_process.poseFinal.*",
+        },
+        sizes={
+            "model.width": ("xatt_norm.weight", 0),
+            "model.depth": "seqTransEncoder.layers.*.linear1.weight",
+            "model.feedforward": ("seqTransEncoder.layers.0.linear1.weight", 0),
+        },
+        unused=("xatt_ff.*", "sequence_pos_encoder.pe"),
+        config={"normalizer.raw_inputs": True, "model.bounded_first": True},
+    )
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
@@ -87,7 +110,7 @@ class RPM(WindowlessModel):
     def __init__(self, normalizer: Normalizer, settings: RPMSettings):
         super().__init__(normalizer, settings.frames)
         self.context, self.horizon = settings.context, settings.horizon
-        self.own_dropout = settings.own_dropout
+        self.own_dropout, self.bounded_first = settings.own_dropout, bool(settings.bounded_first)
         self.motion = nn.Linear(ROTATION.stop, settings.width)
         self.sparse = nn.Linear(SPARSE_DIM, settings.width)
         self.attention = Attention(settings.width, settings.heads)
@@ -143,7 +166,8 @@ class RPM(WindowlessModel):
         previous_inputs = torch.where(state["started"][..., None] > 0, state["sparse"], encoded)
         inputs = torch.cat([previous_inputs, encoded], 1)
         prediction = self.predict(state["motion"], inputs)
-        earlier = torch.cat([state["prediction"][:, 1:], prediction[:, -1:]], 1)
+        newest = prediction[:, -1:] * (0.0 if self.bounded_first else 1.0)
+        earlier = torch.cat([state["prediction"][:, 1:], newest], 1)
         earlier = torch.where(state["predicted"][..., None] > 0, earlier, prediction)
         prediction = earlier + self.freedom * (prediction - earlier).tanh()
         return prediction, {

@@ -2,12 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from memmlp.common.components import find_chosen_settings
 from memmlp.common.settings import Settings, at_least, setting
+
+
+@dataclass(frozen=True)
+class Release:
+    """The format of the checkpoints that a network's authors publish; `memmlp import-weights` reads them.
+
+    Names may contain `*` for any part between dots. A name of the authors may end in `[I/N]`: the I-th of N
+    equal parts of its rows.
+
+    Attributes:
+        source: the repository and the commit whose checkpoints these are.
+        names: the authors' name for the name of each parameter here.
+        sizes: for a config key the authors' parameter and the axis with its size, or names with `*` to count.
+        unused: names of the authors that their network does not use.
+        config: config values of the release.
+    """
+
+    source: str
+    names: dict[str, str]
+    sizes: Mapping[str, tuple[str, int] | str]
+    unused: tuple[str, ...] = ()
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+
+def name_encoder(ours: str, theirs: str) -> dict[str, str]:
+    """Return the names of encoder layers for a Release: ours, and those of `torch.nn.TransformerEncoder`."""
+    parts = {"attention.out": "self_attn.out_proj", "attention_norm": "norm1", "norm": "norm2"}
+    parts |= {"widen": "linear1", "narrow": "linear2"}
+    names = {f"{ours}.{mine}.*": f"{theirs}.{part}.*" for mine, part in parts.items()}
+    for index, part in enumerate(("query", "key", "value")):
+        names[f"{ours}.attention.{part}.*"] = f"{theirs}.self_attn.in_proj_*[{index}/3]"
+    return names
 
 
 @dataclass
@@ -20,6 +52,7 @@ class NetworkSettings(Settings):
         kinematic: the option of `loss` with this project's loss, and the overrides that go with it; searches
             use them.
         trains_by_itself: whether the network's own loss is enough to train it (`loss=of_network`).
+        release: the format of the authors' checkpoints; None if they cannot be imported.
     """
 
     frames: int = setting(at_least(2))  # T, the number of frames in a training window
@@ -27,6 +60,7 @@ class NetworkSettings(Settings):
     learns_newest_frame: ClassVar[bool] = False
     carries_state: ClassVar[bool] = False
     trains_by_itself: ClassVar[bool] = False
+    release: ClassVar[Release | None] = None
     kinematic: ClassVar[str] = "kinematic normalizer.coordinates=heading"
     defaults: ClassVar = {"memory": None, "predictor": None, "hand": None}
     recipe: ClassVar = {

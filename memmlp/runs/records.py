@@ -66,6 +66,7 @@ Origin = _record(
 
 # manifest.json, DONE, FAILED and notes.json
 Attempt = _record(started=Time, step=int, stage=str)
+Imported = _complete_record(model=Name, file=str, sha256=str, source=str)  # imported weights
 PrerequisiteRun = _record(Origin, id=Name, kind=str, weights=str | None)
 Manifest = _record(
     Origin, id=str, kind=str, name=str, user=str | None, data=str, body=str,
@@ -76,6 +77,7 @@ Manifest = _record(
     seconds=dict[str, float] | None, forgiven=int, stages=list[Name],
     steps=int | None, best_step=int | None, tflop=float | None, source_bytes=dict[str, str],
     shipped=str, **dict.fromkeys(("partial", "divided", "resampled", "unusual"), str | None),
+    imported=Imported | None,  # type: ignore[valid-type]
 )  # fmt: skip
 Marker = _record(id=str, finished=Time, artifacts=dict[Name, str])
 Failure = _record(reason=str, when=Time, details=str)

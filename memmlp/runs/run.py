@@ -365,7 +365,9 @@ class Run:
 
     @property
     def total_steps(self) -> int:
-        """The number of steps of the whole training; 0 if unknown."""
+        """The number of steps of the whole training; 0 if unknown, or for imported weights."""
+        if self.manifest.get("imported"):
+            return 0
         if steps := self.manifest.get("steps"):
             return int(steps)
         try:

@@ -179,6 +179,11 @@ class Optim:
         """Return the warm-up's factor on the learning rate at a step, in (0, 1]."""
         return min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
 
+    @property
+    def length(self) -> str:
+        """The length of the training in words, such as "2000 steps"."""
+        return f"{self.steps} steps" if self.tflop is None else f"{self.tflop:g} TFLOP"
+
     def check_installed(self) -> None:
         """Raise InputError if the optimiser's library is not installed."""
 

@@ -77,6 +77,8 @@ class RunRequest:
         network_config = {key: value for key, value in config.items() if key != "vqvae"}
         if codes == "joint":
             network_config["vqvae"] = {key: config["vqvae"][key] for key in VQVAE_SHAPE}
+        if config.get("imported_weights"):
+            return [(NETWORK, network_config)]
         if config["refiner"] is not None:
             bare = remove_refiner(config)
             return [*RunRequest(bare, self.motion)._run_chain, (NETWORK, network_config)]

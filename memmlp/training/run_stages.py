@@ -233,9 +233,7 @@ def train_run(
     on_validation: ValidationCallback | None = None,
 ) -> None:
     """Train a run's network from the weights of the run `before`, and mark the run as done."""
-    optim = experiment.training.optim
-    length = f"{optim.steps} steps" if optim.tflop is None else f"{optim.tflop:g} TFLOP"
-    announce(f"network: training for {length} (run {run.id})")
+    announce(f"{experiment.training.description} (run {run.id})")
     begin_run(experiment, run, experiment.identity(data.digest), experiment.config, before)
     facts = {"body": data.manifest.body, "validation_clips": len(data.manifest.part("val"))}
     run.write_manifest(facts | collect_data_warnings(experiment.config, data))

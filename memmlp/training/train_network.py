@@ -10,9 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.errors import InputError
 from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import UserMetrics
-from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import PreparedMotion
 from memmlp.motion.normalizer import Normalizer
@@ -20,6 +21,7 @@ from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE, measure_rotation_error
+from memmlp.runs.identity import NETWORK
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
 from memmlp.training.losses import Loss
@@ -96,6 +98,12 @@ class NetworkTraining(Training):
     shares: Mapping[str, float] | None = None
     metrics: UserMetrics = field(default_factory=dict)
     mirror: bool = False
+    kind = NETWORK
+
+    @property
+    def description(self) -> str:
+        """A short text about the training, for progress messages."""
+        return f"network: training for {self.optim.length}"
 
     def train(self, job: TrainingJob) -> dict[str, float]:
         task = self.make_task(job.architecture, job.data, job.prerequisite, job.device)
@@ -128,6 +136,56 @@ class NetworkTraining(Training):
             drawn_by=self.drawn_by,
             shares=self.shares,
         )
+
+
+@dataclass(frozen=True)
+class PublishedWeights:
+    """The weights that a network's authors publish, under the names here.
+
+    Attributes:
+        tensors: the network's tensors by name, without the normalizer's.
+        statistics: mean and standard deviation (2, 132) of the rotations; None: those of the training clips.
+        origin: the record of the origin for the manifest (`memmlp.runs.records.Imported`).
+    """
+
+    tensors: Mapping[str, Tensor]
+    statistics: Tensor | None
+    origin: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class WeightsImport(NetworkTraining):
+    """The import of published weights in place of a training.
+
+    Attributes:
+        published: the weights; None if the run exists already.
+    """
+
+    published: PublishedWeights | None = None
+
+    @property
+    def description(self) -> str:
+        """A short text about the import, for progress messages."""
+        return "network: importing published weights"
+
+    def train(self, job: TrainingJob) -> dict[str, float]:
+        """Write the weights; see Training. Nothing is trained. Raises InputError if a config asks for the run,
+        because only `memmlp import-weights` can make it."""
+        if self.published is None:
+            raise InputError("imported_weights: must be null; use memmlp import-weights instead")
+        frames = job.data.open("train").frames
+        normalizer = job.architecture.make_normalizer(job.data.manifest, frames)
+        if self.published.statistics is not None:
+            place = slice(SPARSE_DIM, SPARSE_DIM + ROTATION.stop)
+            normalizer.mean[place], normalizer.std[place] = self.published.statistics
+        model = job.architecture.build(normalizer, None)
+        tensors = checkpoint.collect_module_tensors("model", model)
+        tensors |= {f"model.{name}": tensor for name, tensor in self.published.tensors.items()}
+        origin = self.published.origin
+        text = "{file} (sha256 {sha256}), weights of {source}".format(**origin)
+        checkpoint.write(job.run.model, tensors, {"origin": text})
+        job.run.write_manifest({"imported": dict(origin)})
+        return {}
 
 
 class MotionTask(TrainingTask):

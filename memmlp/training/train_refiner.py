@@ -87,6 +87,11 @@ class RefinerTraining(Training):
     mirror: bool = False
     metrics: UserMetrics = field(default_factory=dict)
 
+    @property
+    def description(self) -> str:
+        """A short text about the training, for progress messages."""
+        return f"refiner: training for {self.optim.length}"
+
     def train(self, job: TrainingJob) -> dict[str, float]:
         assert job.prerequisite is not None
         plain = job.data.open("train").to(job.device)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
+from memmlp.common.overrides import select_last_by_key
 from memmlp.common.text_formats import join_command
 from memmlp.report.tables.effects import (
     RunsBySeed,
@@ -25,9 +26,10 @@ from memmlp.report.tables.effects import (
     use_existing_branches,
 )
 from memmlp.report.tables.flags import DescribeRun, describe_nothing, find_flags, flag_early_tables
-from memmlp.report.tables.measured_run import MeasuredRun, select_runs_for_metric
+from memmlp.report.tables.measured_run import MeasuredRun, load_measured_run, select_runs_for_metric
 from memmlp.report.tables.table import Cell, Effect, Key, Row, Table
 from memmlp.report.tables.table_text import FORMATS
+from memmlp.runs.lookup import is_trained, list_runs
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
 from memmlp.sweep.plan import Plan
 
@@ -77,6 +79,49 @@ def find_finished_runs(sweep: Sweep, find_run: FindRun) -> dict[str, RunsBySeed]
         }
         for variant in sweep.list_runnable()
     }
+
+
+def find_imported_runs(outputs: Path) -> list[MeasuredRun]:
+    """Return the finished runs of imported weights in an outputs folder, the newest first."""
+    found = [run for run in list_runs(outputs) if run.manifest.get("imported") and is_trained(run)]
+    return [load_measured_run(run.folder) for run in found]
+
+
+def list_official_values(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], imported: Sequence[MeasuredRun], modes: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Return rows that compare published values with those of imported weights and of trainings.
+
+    Each row has a variant's label, the weights ("published", the file of imported weights or "trained here"),
+    the mode and the metrics. Imported weights belong to a variant with the same network and data.
+    """
+    rows = []
+    for variant in sweep.variants:
+        chosen = select_last_by_key((*sweep.base, *sweep.command_line, *(variant.overrides or ())))
+        model, data = (chosen[key].value if key in chosen else None for key in ("model", "data"))
+        theirs = [
+            one
+            for one in imported
+            if one.run
+            and (one.run.manifest["imported"]["model"] == model)
+            and data in (None, one.run.config["data"]["name"])
+        ]
+        trained = list(runs.get(variant.label, {}).values())
+        printed = variant.paper or {}
+        numbers = (f"{printed[m]:.2f}" if m in printed else "-" for m in sweep.metrics)
+        rows.append((variant.label, "published", "", *numbers))
+        for mode in modes:
+            for label, found in (("imported", theirs[:1]), ("trained here", trained)):
+                values = (_format_mean(found, mode, variant.branch, metric) for metric in sweep.metrics)
+                shown = found[0].origin.imported if found and label == "imported" else label
+                cells = tuple(values) if found else ("not measured",) + ("",) * (len(sweep.metrics) - 1)
+                rows.append((variant.label, str(shown), mode, *cells))
+    return rows
+
+
+def _format_mean(runs: Sequence[MeasuredRun], mode: str, branch: str, metric: str) -> str:
+    values = [value for run in runs if (value := run.get_value(mode, branch, metric)) is not None]
+    return f"{math.fsum(values) / len(values):.2f}" if values else "not measured"
 
 
 def make_table(

@@ -95,6 +95,7 @@ def find_flags(
     yield from _flag_missed_budgets(every)
     yield from _flag_data_warnings(every, "partial", ", and no more")
     yield from _flag_data_warnings(every, "divided")
+    yield from _flag_data_warnings(every, "imported")
     yield from _flag_unequal_versions(every)
     if uncommitted := [label for label, run in every if run.origin.changed]:
         yield f"made by code with uncommitted changes: {join_quoted(uncommitted)}"

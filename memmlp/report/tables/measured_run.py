@@ -72,6 +72,7 @@ class Origin:
         divided: a warning if subjects have clips in both training and test; None otherwise.
         resampled: a warning if test clips were recorded at a lower rate; None otherwise.
         unusual: a warning if test clips are unusual; None otherwise.
+        imported: the origin of imported weights; None for a training.
     """
 
     code: str
@@ -95,6 +96,7 @@ class Origin:
     divided: str | None = None
     resampled: str | None = None
     unusual: str | None = None
+    imported: str | None = None
     prerequisite_versions: Mapping[str, int] = field(default_factory=dict)
     prerequisite_weights: Mapping[str, str] = field(default_factory=dict)
 
@@ -346,12 +348,14 @@ def _read_origin(manifest: Mapping[str, Any]) -> Origin:
     }
     for name in ("prerequisite", "partial", "divided", "resampled", "unusual"):
         copied[name] = manifest.get(name)
+    imported = manifest.get("imported") or {}
     return Origin(
         code=", ".join([*before, git["commit"][:7]]) if git else f"version {get_text('version')}",
         changed=bool(git.get("dirty")),
         data=get_text("data")[:8],
         hardware=get_text("cpu"),
         processes=str(manifest.get("processes") or 1),
+        imported=f"{imported['file']} of {imported['source']}" if imported else None,
         torch=str((manifest.get("packages") or {}).get("torch") or UNKNOWN),
         component_versions=manifest.get("component_versions") or {},
         **copied,

@@ -16,7 +16,7 @@ from memmlp.common.overrides import flatten
 from memmlp.runs import records
 from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import ConfiguredEvaluations, add_solver_names
-from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, find_training_settings
+from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.run import Run, name_latency
 
@@ -83,7 +83,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
         "data_name": str(listed.get("data.name") or ""),
         "device": str(manifest.get("gpu") or manifest.get("device") or ""),
         "prerequisite": manifest.get("prerequisite") or "",
-        "steps": manifest.get("steps") or _find_total_steps(manifest.get("kind"), config),
+        "steps": manifest.get("steps") or run.total_steps or None,
         "recent": _list_recent_entries(run),
         "config": listed,
         "metrics": _read_metrics(run, {key: config[key] for key in USE_GROUPS if key in config}),
@@ -119,14 +119,6 @@ def _list_recent_entries(run: Run) -> list[list[Any]]:
         [one.step, one.time, loss if math.isfinite(loss) else None]
         for one, loss in zip(log, losses, strict=True)
     ]
-
-
-def _find_total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
-    try:
-        steps = find_training_settings(str(kind), config)["steps"]
-    except (KeyError, TypeError):
-        return None
-    return steps if isinstance(steps, int) else None
 
 
 def _read_metrics(run: Run, config: Mapping[str, Any]) -> dict[str, float]:

@@ -1,0 +1,385 @@
+"""Checkpoints in the formats that authors publish: made here of torch's own layers, imported and run."""
+
+import os
+import pickle
+import struct
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+import torch.nn.functional as F
+from command_line import BRIEF, run
+from torch import Tensor, nn
+
+from memmlp.common.components import find_component
+from memmlp.config.open_run import open_run
+from memmlp.deploy.export import make_metadata
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.network_coordinates import World
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks import checkpoint
+from memmlp.networks.hmd_poser import locate_hands
+from memmlp.networks.motion_model import MotionModel
+from memmlp.report.tables.build_table import find_imported_runs, list_official_values
+from memmlp.runs import records
+from memmlp.runs.lookup import list_runs
+from memmlp.sweep.definition import Sweep, Variant
+
+D, T, DEPTH, HEADS, WIDE = 16, 8, 2, 4, 24
+X = tiny.clip(40)[None, :, :SPARSE_DIM].double()
+pytestmark = pytest.mark.filterwarnings("ignore:enable_nested_tensor")
+
+
+def make_mlp_head(inputs: int, size: int, activation: type[nn.Module] = nn.ReLU, width: int = D) -> nn.Module:
+    return nn.Sequential(nn.Linear(inputs, width), activation(), nn.Linear(width, size))
+
+
+def make_encoder(depth: int) -> nn.Module:
+    return nn.TransformerEncoder(nn.TransformerEncoderLayer(D, HEADS, WIDE, batch_first=True), depth)
+
+
+class Poser(nn.ModuleDict):
+    """AvatarPoser, or EgoPoser with `views`."""
+
+    def __init__(self, root: str, inputs: int, views: bool):
+        super().__init__({
+            "linear_embedding": nn.Linear(inputs, D), "transformer_encoder": make_encoder(DEPTH),
+            root: make_mlp_head(D, 6), "joint_rotation_decoder": make_mlp_head(D, 126),
+        })  # fmt: skip
+        self.root, self.views = root, views
+        if views:
+            self["linear_embedding_fast"] = nn.Linear(inputs, D // 2)
+        else:
+            self["body_model"] = nn.BatchNorm1d(3)  # another module's tensors are in the file, too
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x[:, -T:].clone()
+        if self.views:
+            x[..., [36, 37, 39, 40, 42, 43]] -= x[..., [36, 37] * 3]
+            moved = x[..., [36, 37, 39, 40, 42, 43]]
+            x = torch.cat([x, moved - moved[:, :1]], -1)
+            x = self["linear_embedding"](x[:, ::2]) + self["linear_embedding"](x[:, T // 2 :])
+        else:
+            x = self["linear_embedding"](x)
+        h = self["transformer_encoder"](x)[:, -1]
+        return torch.cat([self[self.root](h), self["joint_rotation_decoder"](h)], -1)[:, None]
+
+
+class Mixer(nn.Module):
+    """A block of AGRoL; with `embed`, for the diffusion model, of which the first merges its inputs."""
+
+    def __init__(self, embed: bool, first: bool):
+        super().__init__()
+        self.fc0, self.fc1 = nn.Conv1d(T, T, 1), nn.Linear(D, D)
+        self.norm0, self.norm1 = nn.LayerNorm(D), nn.LayerNorm(D)
+        if embed:
+            self.emb_fc = nn.Linear(D, D)
+        if embed and first:
+            self.conct = nn.Linear(2 * D, D)
+
+    def forward(self, h: Tensor, time: Tensor | None = None) -> Tensor:
+        if time is not None:
+            h = (self.conct(h) if hasattr(self, "conct") else h) + self.emb_fc(F.silu(time))
+        h = h + F.silu(self.fc0(self.norm0(h)))
+        return h + F.silu(self.fc1(self.norm1(h)))
+
+
+class Mixers(nn.ModuleDict):
+    def __init__(self, embed: bool):
+        super().__init__({"mlps": nn.ModuleList(Mixer(embed, i == 0) for i in range(DEPTH))})
+
+
+class AGRoL(nn.ModuleDict):
+    def __init__(self) -> None:
+        parts = {"input_fc": nn.Linear(54, D), "motion_mlp": Mixers(False), "output_fc": nn.Linear(D, 132)}
+        super().__init__(parts)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self["input_fc"](x[:, -T:])
+        for block in self["motion_mlp"]["mlps"]:
+            h = block(h)
+        return self["output_fc"](h)
+
+
+class Denoiser(nn.ModuleDict):
+    """AGRoL's diffusion model, called once, at time 0, with noise that the test sets."""
+
+    noise: Tensor
+
+    def __init__(self) -> None:
+        super().__init__({
+            "input_process": nn.Linear(132, D), "sparse_process": nn.Linear(54, D),
+            "mlp": nn.ModuleDict({"motion_mlp": Mixers(True)}), "output_process": nn.Linear(D, 132),
+        })  # fmt: skip
+
+    def forward(self, x: Tensor) -> Tensor:
+        noisy = self["input_process"](self.noise).expand(len(x), -1, -1)
+        h = torch.cat([self["sparse_process"](x[:, -T:]), noisy], -1)
+        for block in self["mlp"]["motion_mlp"]["mlps"]:
+            h = block(h, torch.tensor([0.0, 1.0] * (D // 2)).to(h))
+        return self["output_process"](h)
+
+
+SENSORS = ("head", "lhand", "rhand", "lfoot", "rfoot", "pelvis", "lhand_inhead", "rhand_inhead")
+
+
+class HMD(nn.ModuleDict):
+    """HMD-Poser, whose tokens of absent sensors are in the middle."""
+
+    def __init__(self) -> None:
+        def embed(name: str) -> nn.Module:
+            unseen = name in ("lfoot", "rfoot", "pelvis")
+            sizes = zip((6, 6, 3), (7, 7, 2), strict=True) if unseen else ((6, 4), (6, 4), (3, 4), (3, 4))
+            return nn.ModuleList(nn.Sequential(nn.Linear(*size), nn.LeakyReLU()) for size in sizes)
+
+        backbone = nn.ModuleDict({f"{name}_linear_embeddings": embed(name) for name in SENSORS})
+        lstm = nn.ModuleList(nn.LSTM(D, D, batch_first=True) for _ in SENSORS)
+        backbone.update({"norm": nn.LayerNorm(D, eps=1e-6), "time_encoder": nn.ModuleList([lstm])})
+        backbone.update({"spatial_encoder": nn.ModuleList([make_encoder(1)])})
+        heads = {"pose_est": 132, "shape_est": 16}
+        super().__init__(
+            {"backbone": backbone} | {k: make_mlp_head(8 * D, n, nn.LeakyReLU) for k, n in heads.items()}
+        )
+
+    def state_dict(self, *args, **options) -> dict[str, Tensor]:
+        """As weight norm stores LSTMs: a gain and a direction of any length for each row."""
+        state = {}
+        for name, tensor in super().state_dict(*args, **options).items():
+            if ".time_encoder." in name and ".weight_" in name:
+                state[f"{name}_g"], state[f"{name}_v"] = tensor.norm(dim=1, keepdim=True), 3 * tensor
+            else:
+                state[name] = tensor
+        return state
+
+    def forward(self, x: Tensor) -> Tensor:
+        backbone, tokens = self["backbone"], []
+        rotation, turn = x[..., :18].split(6, -1), x[..., 18:36].split(6, -1)
+        position, velocity = x[..., 36:45].split(3, -1), x[..., 45:54].split(3, -1)
+        parts = dict(zip(SENSORS, zip(rotation, turn, position, velocity, strict=True), strict=False))
+        locate = locate_hands(x)
+        parts |= {f"{hand}_inhead": [one[..., i, :] for one in locate] for i, hand in enumerate(SENSORS[1:3])}
+        for name in SENSORS:
+            zeros = [x.new_zeros(*x.shape[:2], size) for size in (6, 6, 3)]
+            pairs = zip(backbone[f"{name}_linear_embeddings"], parts.get(name, zeros), strict=True)
+            tokens.append(backbone["norm"](torch.cat([layer(part) for layer, part in pairs], -1)))
+        h = torch.stack([of(t)[0] for of, t in zip(backbone["time_encoder"][0], tokens, strict=True)], -2)
+        h = backbone["spatial_encoder"][0](h.flatten(0, 1)).view(h.shape)
+        return self["pose_est"](h.flatten(-2))
+
+
+class Rolling(nn.ModuleDict):
+    """RPM at a stream's first frame, after which it has no past."""
+
+    def __init__(self) -> None:
+        layer = nn.TransformerEncoderLayer(D, HEADS, WIDE, activation="gelu", batch_first=True)
+        super().__init__({
+            "input_process": nn.ModuleDict({"poseEmbedding": nn.Linear(132, D)}),
+            "sparse_process": nn.ModuleDict({"poseEmbedding": nn.Linear(54, D)}),
+            "xatt": nn.MultiheadAttention(D, HEADS, batch_first=True), "xatt_norm": nn.LayerNorm(D),
+            "xatt_ff": nn.Linear(D, D), "seqTransEncoder": nn.TransformerEncoder(layer, DEPTH),
+            "output_process": nn.ModuleDict({"poseFinal": nn.Linear(D, 132)}),
+        })  # fmt: skip
+
+    def forward(self, x: Tensor) -> Tensor:
+        angles = torch.arange(20)[:, None] / 10_000 ** (torch.arange(0, D, 2) / D)
+        places = torch.stack([angles.sin(), angles.cos()], -1).flatten(1).to(x)
+        past = self["input_process"]["poseEmbedding"](x.new_zeros(1, 20, 132)) + places
+        seen = self["sparse_process"]["poseEmbedding"](x).expand(-1, 11, -1) + places[:11]
+        h = self["xatt_norm"](past + self["xatt"](past, seen, seen)[0])
+        return self["output_process"]["poseFinal"](self["seqTransEncoder"](h))[:, 10:11]
+
+
+class ModulatedBlock(nn.ModuleDict):
+    """A block of BoDiffusion."""
+
+    def __init__(self) -> None:
+        parts = {"attn": {"qkv": nn.Linear(D, 3 * D), "proj": nn.Linear(D, D)}}
+        parts |= {"mlp": {"fc1": nn.Linear(D, D), "fc2": nn.Linear(D, D)}}
+        super().__init__({name: nn.ModuleDict(layers) for name, layers in parts.items()})
+        self["adaLN_modulation"] = nn.Sequential(nn.SiLU(), nn.Linear(D, 6 * D))
+
+    def forward(self, h: Tensor, time: Tensor) -> Tensor:
+        changes = self["adaLN_modulation"](time)[:, None].chunk(6, -1)
+        seen = F.layer_norm(h, [D], eps=1e-6) * (1 + changes[1]) + changes[0]
+        parts = self["attn"]["qkv"](seen).unflatten(-1, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
+        attended = F.scaled_dot_product_attention(*parts).transpose(1, 2).flatten(2)
+        h = h + changes[2] * self["attn"]["proj"](attended)
+        seen = F.layer_norm(h, [D], eps=1e-6) * (1 + changes[4]) + changes[3]
+        return h + changes[5] * self["mlp"]["fc2"](F.gelu(self["mlp"]["fc1"](seen), approximate="tanh"))
+
+
+class JointDenoiser(nn.ModuleDict):
+    """BoDiffusion, called once for still motion at time 7."""
+
+    def __init__(self) -> None:
+        super().__init__({
+            "embed_timestep": nn.ModuleDict({"mlp": make_mlp_head(256, D, nn.SiLU)}),
+            "cond_emb": nn.ModuleDict({"projections": nn.Linear(3, 22, bias=False)}),
+            "input_process": nn.ModuleDict({"poseEmbedding": nn.Linear(22 * 24, D)}),
+            "blocks": nn.ModuleList(ModulatedBlock() for _ in range(DEPTH)),
+            "out": nn.ModuleDict({"poseFinal": nn.Linear(D, 22 * 24), "featsFinal": nn.Linear(24, 12)}),
+        })  # fmt: skip
+        self.pos_embed = nn.Parameter(torch.randn(1, T, D))
+
+    def forward(self, x: Tensor) -> Tensor:
+        angles = 7 * torch.exp(-torch.log(torch.tensor(1e4)) * torch.arange(128) / 128)
+        time = self["embed_timestep"]["mlp"](torch.cat([angles.cos(), angles.sin()]).to(x)[None])
+        mixed = self["cond_emb"]["projections"](x.unflatten(-1, (3, 18)).transpose(-1, -2)).transpose(-1, -2)
+        joints = torch.cat([torch.ones_like(mixed[..., :6]), mixed], -1).flatten(-2)
+        h = self["input_process"]["poseEmbedding"](joints) + self.pos_embed
+        for block in self["blocks"]:
+            h = block(h, time)
+        return self["out"]["featsFinal"](self["out"]["poseFinal"](h).unflatten(-1, (22, 24)))
+
+
+def denoise_still_motion(model: MotionModel, x: Tensor) -> Tensor:
+    noise, variance = model.denoise(torch.ones(1, T, 132).to(x), torch.tensor([7]), x)
+    return torch.cat([part.unflatten(-1, (22, 6)) for part in (noise, variance)], -1)
+
+
+TRANSFORMER = {"depth": DEPTH, "heads": HEADS, "width": D, "feedforward": WIDE, "dropout": 0.1}
+RELEASED = {
+    "avatar_poser": (lambda: Poser("stabilizer", 54, False), {"frames": T, **TRANSFORMER}),
+    "ego_poser": (lambda: Poser("global_orientation_decoder", 60, True), {"frames": T, **TRANSFORMER}),
+    "agrol_mlp": (AGRoL, {}),
+    "agrol_diffusion": (Denoiser, {"diffusion_steps": 50, "sampling_steps": 1, "sampler": "posterior"}),
+    "hmd_poser": (HMD, {"frames": T, "heads": HEADS, "dropout": 0.1, "shape_weight": 0.1}),
+    "rpm": (Rolling, {"frames": 20, "bounded_first": True, "own_dropout": False, **TRANSFORMER}),
+    "bodiffusion": (JointDenoiser, {"heads": HEADS, "sampling_steps": 2, "noise_weight": 1.0}),
+}  # fmt: skip
+
+
+def make_released(name: str) -> nn.Module:
+    torch.manual_seed(1)
+    return RELEASED[name][0]().eval()
+
+
+def import_tensors(name: str, path: Path) -> MotionModel:
+    network, (_, sizes) = find_component("model", name), RELEASED[name]
+    tensors, release = checkpoint.read_published(path), network.settings.release
+    tensors = network.kind.adapt_published(tensors)
+    found = {key.split(".")[1]: n for key, n in checkpoint.find_published_sizes(tensors, release).items()}
+    settings = network.make_settings({**sizes, **found})
+    model = network.kind(Normalizer.from_coordinates(World(), tiny.REST), settings)
+    renamed = checkpoint.rename_published(tensors, release, dict(model.named_parameters()))
+    model.load_state_dict(renamed, strict=False)
+    return model.eval().double()
+
+
+@pytest.mark.parametrize("name", RELEASED)
+@torch.no_grad()
+def test_an_imported_network_computes_what_the_released_layers_compute(name: str, tmp_path: Path) -> None:
+    released = make_released(name)
+    torch.save({"state_dict": released.state_dict(), "epoch": 3}, tmp_path / "net.pth")
+    model = import_tensors(name, tmp_path / "net.pth")
+    released.double().noise = getattr(model, "noise", torch.zeros(1))[0]
+    inputs = {"avatar_poser": X, "ego_poser": X, "rpm": X[:, :1]}.get(name, X[:, -T:])
+    expected = released(inputs)
+    if name == "bodiffusion":
+        computed = denoise_still_motion(model, inputs)
+    else:
+        motion, _ = model.advance(inputs, model.initial_state(1), expected.shape[1])
+        computed = motion[..., :132]
+    torch.testing.assert_close(computed, expected, atol=1e-7, rtol=1e-6)
+
+
+@pytest.fixture
+def sound(tmp_path: Path) -> dict[str, Tensor]:
+    return make_released("agrol_mlp").state_dict()
+
+
+class Code:
+    def __reduce__(self):
+        return os.mkdir, ("executed",)
+
+
+def write_zip(path: Path, compression: int) -> None:
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr("net/data.pkl", pickle.dumps({"a": 1}))
+
+
+HOSTILE = {
+    "code": lambda path, sound: torch.save(Code(), path),
+    "pickle with code": lambda path, sound: path.write_bytes(pickle.dumps({"w": Code()})),
+    "truncated": lambda path, sound: (torch.save(sound, path), os.truncate(path, path.stat().st_size // 2)),
+    "empty": lambda path, sound: path.write_bytes(b""),
+    "text": lambda path, sound: path.write_text("version https://git-lfs.github.com/spec/v1"),
+    "header of 2 GB": lambda path, sound: path.write_bytes(struct.pack("<Q", 2**31) + b"{" * 64),
+    "long pickle": lambda path, sound: path.write_bytes(b"\x80\x04\x8e" + struct.pack("<Q", 2**31) + b"x"),
+    "compressed": lambda path, sound: write_zip(path, zipfile.ZIP_DEFLATED),
+    "missing key": lambda path, sound: (sound.pop("motion_mlp.mlps.1.fc1.weight"), torch.save(sound, path)),
+    "foreign key": lambda path, sound: torch.save(sound | {"decoder.weight": torch.ones(3)}, path),
+    "other shape": lambda path, sound: torch.save(sound | {"output_fc.bias": torch.ones(131)}, path),
+    "other network": lambda path, sound: torch.save(make_released("avatar_poser").state_dict(), path),
+    "NaN": lambda path, sound: (sound["input_fc.bias"].fill_(torch.nan), torch.save(sound, path)),
+    "wide in little": lambda path, sound: torch.save(
+        sound | {"input_fc.weight": torch.ones(1).expand(2**40, 54)}, path
+    ),
+    "deep in little": lambda path, sound: torch.save(
+        sound | {f"motion_mlp.mlps.{i}.fc0.weight": torch.ones(1) for i in range(9999)}, path
+    ),
+    "words": lambda path, sound: torch.save(sound | {"output_fc.bias": "1, 2, 3"}, path),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_bad_checkpoint_is_one_line_and_leaves_nothing(
+    kind: str, sound: dict[str, Tensor], tmp_path: Path
+) -> None:
+    path = tmp_path / "net.pth"
+    HOSTILE[kind](path, sound)
+    text = run(tmp_path, "import-weights", "agrol_mlp", "net.pth", *BRIEF, code=2)
+    assert text.startswith("memmlp: net.pth: ")
+    assert text.count("\n") == 1
+    assert len(text) < 300
+    assert os.listdir(tmp_path) == ["net.pth"]
+
+
+def test_only_networks_with_a_release_are_imported(tmp_path: Path) -> None:
+    assert "agrol_mlp" in run(tmp_path, "import-weights", "vae_hmd", "net.pth", code=2)
+    assert "net.pth" in run(tmp_path, "import-weights", "agrol_mlp", "net.pth", code=2)
+    alone = ["imported_weights=0123456789abcdef", "model=agrol_mlp", "model.depth=1", *BRIEF[2:]]
+    assert "imported_weights" in run(tmp_path, "train", "profile=tiny", *alone, code=2)
+
+
+def check_official_rows(outputs: Path) -> None:
+    """The imported run stands between the published value and the missing training."""
+    variant = Variant("AGRoL-Diffusion", ("model=agrol_diffusion",), paper={"MPJPE": 3.71})
+    sweep = Sweep("t", "T", 1, (), ("data=synth",), (0,), (variant,), variant.label, ("MPJPE",))
+    (imported,) = find_imported_runs(outputs)
+    published, theirs, trained = list_official_values(sweep, {}, [imported], ["window"])
+    assert published == (variant.label, "published", "", "3.71")
+    assert theirs[1].startswith("net.pt of ")
+    assert float(theirs[-1]) == pytest.approx(imported.get_value("window", "rotation", "MPJPE"), abs=0.006)
+    assert trained == (variant.label, "trained here", "window", "not measured")
+    elsewhere = replace(sweep, base=("data=amass_s1",))
+    assert list_official_values(elsewhere, {}, [imported], ["window"])[1][-1] == "not measured"
+
+
+def test_the_command_makes_a_finished_run_that_names_its_origin(tmp_path: Path) -> None:
+    released = make_released("agrol_diffusion")
+    torch.save(released.state_dict(), tmp_path / "net.pt")
+    torch.save(torch.full((132,), 0.5), tmp_path / "mean.pt")
+    torch.save(torch.full((132,), 0.1), tmp_path / "std.pt")
+    options = ["--mean", "mean.pt", "--std", "std.pt", "evaluation.modes=[window]", "export.graph=off"]
+    text = run(tmp_path, "import-weights", "agrol_diffusion", "net.pt", *BRIEF[2:], *options, "profile=tiny")
+    (found,) = list_runs(tmp_path / "outputs")
+    assert found.complete
+    assert found.id in text
+    origin = records.read(found.manifest_path, records.Manifest)["imported"]
+    assert (origin["model"], origin["file"]) == ("agrol_diffusion", "net.pt")
+    tensors, _ = checkpoint.read(found.model)
+    torch.testing.assert_close(tensors["model.normalizer.mean"][54:186], torch.full((132,), 0.5))
+    assert not tensors["model.normalizer.mean"][:54].any()
+    opened = open_run(tmp_path / "outputs", found.id)
+    assert "net.pt" in make_metadata(opened.network(), found.id)["weights"]
+    assert "published weights" in run(tmp_path, "runs", "list")
+    check_official_rows(tmp_path / "outputs")
+    repeated = run(
+        tmp_path, "import-weights", "agrol_diffusion", "net.pt", *BRIEF[2:], *options, "profile=tiny"
+    )
+    assert found.id in repeated
+    assert len(list_runs(tmp_path / "outputs")) == 1
