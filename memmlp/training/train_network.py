@@ -169,8 +169,8 @@ class WeightsImport(NetworkTraining):
         return "network: importing published weights"
 
     def train(self, job: TrainingJob) -> dict[str, float]:
-        """Write the weights; see Training. Nothing is trained. Raises InputError if a config asks for the run,
-        because only `memmlp import-weights` can make it."""
+        """Write the weights; see Training. Nothing is trained. Raises InputError if a config asks for the
+        run, because only `memmlp import-weights` can make it."""
         if self.published is None:
             raise InputError("imported_weights: must be null; use memmlp import-weights instead")
         frames = job.data.open("train").frames
