@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 PLAIN_OVERRIDE = re.compile(r"(?!(?:true|false|null|inf|nan)$)[A-Za-z_/][A-Za-z0-9_/.+@-]*", re.IGNORECASE)
 HOME = re.compile(r"(?<=[=\[,])~(?=/|$|[\],])[^,\[\]'\"]*")
+UNUSUAL_NUMBER = re.compile(
+    r"(?<==)[+-]?(?:0\d[\d_]*|\d+_[\d_]*\d)$"
+)  # a key of a number accepts it as text, too
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "'")
 
 TEX_ESCAPES = {
@@ -63,8 +66,11 @@ def escape_interpolations(value: Any) -> Any:
     return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
 
 
-def expand_home(override: str) -> str:
-    """Return an override with the home folder in place of ~ at the start of its value or of a list's item."""
+def keep_text(override: str) -> str:
+    """Return an override that Hydra does not change: with the home folder in place of ~ at the start of its
+    value or of a list's item, and with quotes around a number whose digits are not plain, such as 010."""
+    if number := UNUSUAL_NUMBER.search(override):
+        return f"{override[: number.start()]}'{number[0]}'"
     return HOME.sub(lambda match: make_override("", os.path.expanduser(match[0]))[1:], override)
 
 

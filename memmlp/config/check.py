@@ -177,7 +177,7 @@ def _describe_expected(name: str, schema: Any, error: OmegaConfBaseException) ->
     own = name.split(".")[-1]
     hint = get_type_hints(schema).get(own, Any)
     rule = next((one.metadata.get("rule") for one in dataclasses.fields(schema) if one.name == own), None)
-    return _describe_type(hint) if rule is None else f"{_describe_type(hint)}, {rule}"
+    return _describe_type(hint) if rule is None else f"{_describe_type(hint)}, {rule.words}"
 
 
 def _describe_type(hint: Any) -> str:

@@ -29,7 +29,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import Override, flatten, parse_overrides, select_last_by_key
 from memmlp.common.settings import Settings
-from memmlp.common.text_formats import expand_home, join_command, make_override
+from memmlp.common.text_formats import join_command, keep_text, make_override
 from memmlp.config import plugins
 from memmlp.config.check import check, describe_unknown_key, explain_error
 from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register_components
@@ -67,7 +67,7 @@ def parse_hydra_arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--info", "-i", nargs="?", const="all")
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_intermixed_args(list(argv))
-    args.overrides = list(map(expand_home, args.overrides))
+    args.overrides = list(map(keep_text, args.overrides))
     plugins.activate(plugins.find_named_packages(args.overrides))
     Plugins.instance().register(UserConfigs)
     register_components()

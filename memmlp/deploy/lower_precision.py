@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,10 +138,23 @@ def _quantise_to_int8(source: Path, path: Path, inner: list[str], clips: Sequenc
                 weight_type=QuantType.QInt8,
                 extra_options={"OpTypesToExcludeOutputQuantization": ["Gemm", "MatMul"]},
             )
+            _check_quantised(onnx.load(unfinished), inner)
         publish(unfinished, path)
     finally:
         root.setLevel(level)
         unfinished.unlink(missing_ok=True)
+
+
+def _check_quantised(model: ModelProto, inner: Collection[str]) -> None:
+    """Raise RuntimeError if a layer kept its weight in float32; ONNX Runtime may skip layers silently."""
+    quantised = {
+        name for node in model.graph.node if node.op_type == "DequantizeLinear" for name in node.output
+    }
+    layers = {node.name: node.input[1] for node in model.graph.node if node.name in inner}
+    if skipped := [name for name in inner if layers.get(name) not in quantised]:
+        raise RuntimeError(
+            f"ONNX Runtime left {len(skipped)} of {len(inner)} layers in float32, such as {skipped[0]}"
+        )
 
 
 def convert_to_int8_blocks(model: ModelProto, inner: Sequence[str]) -> ModelProto:

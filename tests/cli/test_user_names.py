@@ -57,13 +57,18 @@ def test_packages_of_any_name_are_refused_in_one_line(memmlp: Memmlp, tmp_path: 
 
 def test_folders_of_any_name_keep_their_runs(memmlp: Memmlp, tmp_path: Path):
     """Listed, exported and imported."""
-    made = complete(tmp_path / "made here").folder
+    before = tmp_path / "before"
+    made = complete(before)
     for number, name in enumerate(name for name in make_names() if name not in (".", "..")):
-        outputs = tmp_path / name
-        run = Run(shutil.copytree(made, outputs / "runs" / made.name))
+        outputs = before.rename(tmp_path / name)
+        run = Run(outputs / "runs" / made.id)
         if number < len(EDGES):
             assert run.id in memmlp("runs", "list", "--outputs", str(outputs)).out
-        export_run(run, outputs / f"{name[:99]} run.zip")
-        import_run(outputs / f"{name[:99]} run.zip", outputs / "there")
+        file = outputs / f"{name[:99]} run.zip"
+        export_run(run, file)
+        import_run(file, outputs / "there")
         (moved,) = list_runs(outputs / "there")
         assert (moved.manifest, moved.verify()) == (run.manifest, [])
+        shutil.rmtree(outputs / "there")
+        file.unlink()
+        before = outputs

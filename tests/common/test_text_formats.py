@@ -14,6 +14,8 @@ from omegaconf import OmegaConf
 from sqlalchemy import make_url
 
 from memmlp.common import text_formats as formats
+from memmlp.common.errors import InputError
+from memmlp.config.compose import compose_config
 
 PIECES = [
     *"abz019é漢\u202e😀\u200d'\"\\ $%{}=,[]()~:;#&|<>*?!@`^-+./_\n\t\x1b",
@@ -86,9 +88,20 @@ def test_sqlite_urls(text: str):
 
 def test_home_in_overrides(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HOME", "/home/jörg")
-    assert formats.expand_home("data.root=~/amass") == "data.root='/home/jörg/amass'"
-    assert formats.expand_home("data.root=[~/a,/b]") == "data.root=['/home/jörg/a',/b]"
-    assert [formats.expand_home(text) for text in ("~key", "a=b~c")] == ["~key", "a=b~c"]
+    assert formats.keep_text("data.root=~/amass") == "data.root='/home/jörg/amass'"
+    assert formats.keep_text("data.root=[~/a,/b]") == "data.root=['/home/jörg/a',/b]"
+    assert [formats.keep_text(text) for text in ("~key", "a=b~c")] == ["~key", "a=b~c"]
+
+
+@pytest.mark.parametrize("text", ["010", "1_000", "+05"])
+def test_folders_that_look_like_numbers_keep_their_names(text: str):
+    assert compose_config([f"save_predictions={text}"])["save_predictions"] == text
+    assert compose_config([f"seed={text}"])["seed"] == int(text)
+
+
+def test_a_wrong_type_names_the_limits():
+    with pytest.raises(InputError, match=r"expected an integer, at least 1$"):
+        compose_config(["optim.steps=1e3"])
 
 
 def test_a_console_prints_texts_as_they_are(capsys: pytest.CaptureFixture[str]):

@@ -1,5 +1,6 @@
 """Lower precisions: which layers have them, what they compute, and what they cost."""
 
+import shutil
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -95,6 +96,19 @@ def test_a_product_in_blocks_is_that_of_the_rounded_weight():
 
     np.testing.assert_allclose(made, rounded(values) @ rounded(weight).T + bias, atol=2e-3)
     assert np.abs(made - (values @ weight.T + bias)).max() > 2e-3
+
+
+def test_layers_that_onnx_runtime_skips_are_an_error(
+    step_files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """As versions did with some layers of transformers."""
+    monkeypatch.setattr(
+        lower_precision, "quantize_static", lambda source, path, *_, **__: shutil.copy(source, path)
+    )
+    stream = make_streaming_graph(exported.NETWORKS["mem_mlp"]())
+    with pytest.raises(RuntimeError, match="layers in float32"):
+        write_lower_precision("int8", step_files("mem_mlp"), tmp_path / "int8.onnx", stream, CLIPS)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("precision", ["int8", "fp16"])
