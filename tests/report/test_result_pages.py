@@ -45,11 +45,9 @@ def test_a_template_names_what_holds(sweep: Sweep, kept: KeptResults):
 def test_a_page_has_each_mean_and_its_file_every_number(sweep: Sweep, kept: KeptResults):
     made = source(sweep, kept)
     files = make_pages({"t": made}, {})
-    lines = {
-        (line["variant"], line["mode"], line["branch"], line["metric"]): line
-        for line in parse_csv(files["tables/t.csv"])
-        if line["test clips"] == "all"
-    }
+    every = [line for line in parse_csv(files["tables/t.csv"]) if line["test clips"] == "all"]
+    lines = {(line["variant"], line["mode"], line["branch"], line["metric"]): line for line in every}
+    assert len(lines) == len(every)
     for row, mode in itertools.product(made.table.rows, made.table.modes):
         for metric, cell in row.cells[mode].items():
             line = lines[row.label, mode, row.branch, metric]
@@ -158,9 +156,11 @@ def test_every_interval_of_the_clone_follows_from_what_is_kept():
         checked = 0
         for line in lines:
             row = rows[line["test clips"], line["variant"]]
-            if line["difference low"] and line["branch"] == row.branch:
+            table = one.by_clips[line["test clips"]]
+            branches = {other.label: other.branch for other in table.rows}
+            own = (row.branch, branches.get(line["compared with"]))
+            if line["difference low"] and (line["branch"], line["its branch"]) == own:
                 clips = None if line["test clips"] == "all" else line["test clips"]
-                table = one.by_clips[line["test clips"]]
                 interval = by_hand(content, row, table, line["mode"], line["metric"], clips)
                 shown = float(line["difference low"]), float(line["difference high"])
                 assert shown == pytest.approx(interval, rel=1e-4)
