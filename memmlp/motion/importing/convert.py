@@ -203,7 +203,9 @@ def _compute_rest(
     if not isinstance(rest, int):
         return recording.compute_pose(rest)
     if rest >= len(recording):
-        raise InputError(f"{recording.path}: rest: frame {rest}: must be from 0 to {len(recording) - 1}")
+        raise InputError(
+            f"{recording.path}: rest: frame {rest}: must be one of frames 0 to {len(recording) - 1}"
+        )
     rotations, positions = recording.compute_kinematics()
     return rotations[rest], positions[rest] - positions[rest, 0]
 

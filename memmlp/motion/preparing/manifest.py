@@ -99,7 +99,7 @@ class Coverage:
         by_subset = [
             f"{name} {count} of {self.entry_counts[name]}" for name, count in self.missing_counts.items()
         ]
-        return f"{total - present} of {total} listed entries have no clip ({', '.join(by_subset)})"
+        return f"{total - present} of {total} entries of the list have no clip ({', '.join(by_subset)})"
 
     def check(self, root: Root) -> None:
         """Raise InputError unless every entry has a clip below the data folder."""
