@@ -66,7 +66,8 @@ def format_card(card: Mapping[str, Any]) -> Iterator[str]:
     for part, own in persons.items():
         yield f"| {part} | {', '.join(own)} | {card['clips'][part]} | {card['minutes'][part]:g} |"
     yield ""
-    yield "Errors in stream mode, with 95 % intervals over the test persons:"
+    count = len(persons["test"])
+    yield f"Errors as a live stream (mode `stream`), with 95 % intervals over {count} test persons:"
     yield ""
     yield "| branch | MPJRE deg | MPJPE cm | MPJVE cm/s | Jitter 10² m/s³ |"
     yield "|---|---:|---:|---:|---:|"
@@ -74,10 +75,11 @@ def format_card(card: Mapping[str, Any]) -> Iterator[str]:
         cells = [_format_interval(row.get(metric)) for metric in ("MPJRE", "MPJPE", "MPJVE", "Jitter")]
         yield f"| {branch} | {' | '.join(cells)} |"
     errors = card["errors"]["rotation"]
-    jitter = f", true Jitter {errors['GT Jitter'][0]:.2f}" if "GT Jitter" in errors else ""
     yield ""
+    if "GT Jitter" in errors:
+        yield f"- The true Jitter of all test clips is {errors['GT Jitter'][0]:.2f}."
     yield f"- On the shipped clip (`{clip['name']}`, {clip['seconds']:g} s, a test person): " + (
-        f"MPJPE {clip['errors']['rotation']['MPJPE']:.2f} cm{jitter} on all test clips."
+        f"MPJPE {clip['errors']['rotation']['MPJPE']:.2f} cm."
     )
     yield (
         f"- Training: {recipe['steps']} steps of {recipe['batch']} windows of {recipe['frames']} frames, "
