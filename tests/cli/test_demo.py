@@ -19,7 +19,7 @@ TINY = [
 def test_the_demo_ends_with_a_table_and_a_file(memmlp, tmp_path: Path):
     ran = memmlp("demo", *TINY, "--outputs", str(tmp_path))
     assert ran.code == 0, ran.err
-    assert [line[:2] for line in ran.out.splitlines() if line[:1].isdigit()] == ["1.", "2.", "3."]
+    assert [line[:3] for line in ran.out.splitlines() if line[1:3] == ". "] == ["1. ", "2. ", "3. "]
     assert "Without memory" in ran.out
     assert f"{read_card(DEFAULT)['clip']['errors']['rotation']['MPJPE']:.1f} cm" in ran.out
     picture = ElementTree.parse(tmp_path / "demo" / "clip.svg")

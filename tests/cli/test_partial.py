@@ -20,7 +20,7 @@ TINY = [
 ]  # fmt: skip
 S1 = ["data=amass_s1", "data.root=amass", "data.split.folder=lists"]
 PART = "amass_s1, 87 % of the list (7 of 8 entries), 2 of 3 subsets (without BioMotionLab_NTroje)"
-REFUSED = "data.root=amass: 1 of 8 entries of the split's list have no clip (MPI_HDM05 1 of 4)"
+REFUSED = "data.root=amass: 1 of 8 entries of the list have no clip (MPI_HDM05 1 of 4)"
 
 
 @pytest.fixture

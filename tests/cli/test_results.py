@@ -72,7 +72,7 @@ def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None
     (["save", "10"], ("no finished run", "memmlp sweep table10")),
     (["save", "14", "optim.lr=1"], ("table14.json", "memmlp sweep table14 optim.lr=1", "--name")),
     (["save", "14", "--out", "/proc/no"], ("/proc/no",)),
-    (["show", "15"], ("data/15.json", "no results with this name", "table14")),
+    (["show", "15"], ("data/15.json", "must be one of: table14")),
     (["docs", "--folder", "elsewhere"], ("elsewhere/data", "--out elsewhere/data")),
 ])  # fmt: skip
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):

@@ -126,7 +126,6 @@ BAD = {
     ],
     "texts that would be others": [
         (["save_predictions="], ["save_predictions=:", "a folder, or null"]),
-        (["save_predictions=2024_11"], ["save_predictions=2024_11", "202411", "='2024_11'\""]),
         (["paths.outputs=1e3"], ["paths.outputs=1e3", "1000.0", "quote the value"]),
         (["-m", "save_predictions=a,1_0"], ["save_predictions=a,1_0", "10", "quote the value"]),
         (["data=mocap", "data.root=.", "data.split.groups=[a,10_01]"], ["data.split.groups", "1001"]),

@@ -38,7 +38,7 @@ CHANGES: dict[str, str] = {
     "data.mirror": "true", "data.split.test": "0.3", "data.split.val": "0.3",
     "data.split.train_fraction": "0.5",
     "data.split.seed": "1", "data.split.groups": "['[a-d]1']", "data.split.groups_file": "groups.csv",
-    "normalizer.coordinates": "world", "normalizer.z_scores": "false",
+    "normalizer.coordinates": "world", "normalizer.z_scores": "false", "normalizer.raw_inputs": "true",
     "model.frames": "6", "model.width": "12", "model.depth": "3",
     "memory.layers": "[2,4]", "memory.width": "5", "memory.shift": "window", "memory.history": "latest",
     "memory.fusion": "plain", "memory.blend": "1",
@@ -62,6 +62,7 @@ CHANGES: dict[str, str] = {
 
 UNTRIED = {
     "paths.outputs", "plugins",  # change no run
+    "imported_weights",  # set by import-weights: tests/networks/test_published_weights.py
     "data.root", "data.sources", "data.synth", "data.body",  # other clips or bodies are another digest
     "data.interpolation", "data.split.per_group", "data.split.divide",  # without use here: tests/motion
     "term", "evaluation.metrics",  # of a user's package: tests/config/test_plugins.py

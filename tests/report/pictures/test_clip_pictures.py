@@ -94,7 +94,7 @@ def test_bad_files_are_rejected(tmp_path, monkeypatch):
     for write in (lambda path: check_picture_path(path), lambda path: write_picture(path, make_piece(7))):
         with pytest.raises(InputError, match=r"memmlp\[video\]"):
             write(tmp_path / "a.mp4")
-    with pytest.raises(InputError, match=r"a\.pdf: must end in \.png"):
+    with pytest.raises(InputError, match=r"a\.pdf: must end in .*\.png"):
         check_picture_path(tmp_path / "a.pdf")
     with pytest.raises(InputError, match="there is no folder"):
         check_picture_path(tmp_path / "none" / "a.png")

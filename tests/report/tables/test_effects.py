@@ -187,7 +187,7 @@ def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
     assert rows == {"no | memory": "rotation", "by position": "position", "full_model": "combined"}
     assert len([flag for flag in table.flags if "row shows rotation: 'no | memory'" in flag]) == 1
     lines = " ".join(printed(table, 100).split())
-    assert "combined; 'no | memory' rotation, 'by position' position" in lines
+    assert "rotation (position for 'by position'; combined for 'full_model')" in lines
     assert "the text says so" not in lines  # the paper's values are of another branch
     assert cell(table, "full_model", "MPJPE").paper is None
     verdicts = {row.cells["stream"]["MPJPE"].effect.verdict for row in table.rows[1:3]}
