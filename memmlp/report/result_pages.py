@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,7 +13,7 @@ from memmlp.common.errors import InputError, import_optional
 from memmlp.common.text_formats import escape_markdown
 from memmlp.report.kept_results import KeptResults
 from memmlp.report.pictures.frontier import draw_frontiers, has_frontier
-from memmlp.report.tables.flags import join_first
+from memmlp.report.tables.flags import join_first, join_quoted
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Cell, Row, Table
@@ -44,6 +43,7 @@ ORIGIN = {
 }  # fmt: skip
 BRANCHES = {"": "branch that the paper prints", "rotation": "rotation branch", "position": "position branch"}
 UNDECIDED = (Verdict.INCONCLUSIVE, Verdict.EQUIVALENT)
+RATIO = "ratio"  # column of a step's time over the time of a fixed network
 
 
 class KeptTable(NamedTuple):
@@ -103,7 +103,7 @@ def _make_page(name: str, source: KeptTable) -> str:
     parts = [f"# {escape_markdown(make_caption(table))}", " ".join(_describe_table(source))]
     if has_frontier(table):
         parts.append(f"![Error against compute and latency, with 95 % intervals]({name}_frontier.svg)")
-    parts.append(_make_series_table(table) if _has_cells(table) else _make_short_table(table))
+    parts.append(_make_series_table(source) if _has_cells(table) else _make_short_table(source))
     if remarks := _list_number_remarks(table):
         short = (textwrap.shorten(one, MAX_REMARK, placeholder=" …") for one in remarks)
         parts.append("\n".join(f"- {escape_markdown(one)}" for one in short))
@@ -126,14 +126,16 @@ def _describe_table(source: KeptTable) -> Iterator[str]:
         return
     yield f"Mode: {table.modes[0]}; {escape_markdown(describe_branches(table))}."
     if any(table.list_effects(table.modes[0])):
-        others = "" if _has_several_controls(table) else f" from '{escape_markdown(table.control)}'"
-        yield f"In parentheses: the difference{others} and its [verdict](README.md#verdicts)."
+        verdict = "its [verdict](README.md#verdicts)"
+        yield f"In parentheses: the difference from {_name_control(table)} and {verdict}."
+        if table.comparisons:
+            yield f"Verdicts are corrected for this page's {table.comparisons} comparisons."
         yield from _count_by_branch(table)
         if power := describe_power(table, table.modes[0]):
             yield f"{power[0].upper()}{power[1:]}."
-    for row in table.rows:
-        if row.confounded:
-            yield escape_markdown(f"{CONFOUNDED} confounded: {row.confounded}.")
+    for reason in dict.fromkeys(row.confounded for row in table.rows if row.confounded):
+        labels = dict.fromkeys(row.series or row.label for row in table.rows if row.confounded == reason)
+        yield escape_markdown(f"{CONFOUNDED} {join_quoted(labels)} confounded: {reason}.")
 
 
 def _count_by_branch(table: Table) -> Iterator[str]:
@@ -147,6 +149,16 @@ def _count_by_branch(table: Table) -> Iterator[str]:
             yield f"{head}: {format_counts(counts)}."
 
 
+def _name_control(table: Table) -> str:
+    """Name what differences on a page are from."""
+    if _has_cells(table):
+        series = next(row.series for row in table.rows if row.label == table.control)
+        return f"'{escape_markdown(series)}' in the same line (for itself, in the first line)"
+    if _has_several_controls(table):
+        return "the variant under 'compared with'"
+    return f"'{escape_markdown(table.control)}'"
+
+
 def _has_several_controls(table: Table) -> bool:
     return any(row.against not in (None, table.control) for row in table.rows)
 
@@ -156,9 +168,11 @@ def _has_cells(table: Table) -> bool:
     return len({row.series for row in table.rows}) < len(table.rows)
 
 
-def _make_short_table(table: Table) -> str:
+def _make_short_table(source: KeptTable) -> str:
     """Return a table with a line for each variant, and a line with the paper's values if there are any."""
+    table = source.table
     mode, several = table.modes[0], _has_several_controls(table)
+    controls = {row.label: row.cells[mode] for row in table.rows}
     lines = []
     for row in (row for row in table.rows if row.found or row.is_paper_only):
         cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
@@ -166,42 +180,79 @@ def _make_short_table(table: Table) -> str:
         head = [label, escape_markdown(row.against or "")] if several else [label]
         if row.found:
             seeds = f"{len(row.found)}/{len(row.wanted)}"
-            lines.append([*head, seeds, *(_describe_cell(cell, metric) for cell, metric in cells)])
+            others = controls.get(row.against or "", {})
+            numbers = (_describe_cell(cell, metric, others.get(metric)) for cell, metric in cells)
+            lines.append([*head, seeds, *numbers])
         if any(cell.paper is not None for cell, _ in cells):
             first = ["" if row.found else one for one in head]
             lines.append([*first, "paper", *(format_paper(cell, metric) for cell, metric in cells)])
-    heads = ["variant", *(["compared with"] if several else []), "seeds", *map(make_heading, table.metrics)]
-    return _make_markdown_table(heads, lines)
+    columns = [_make_column_heading(source, metric) for metric in table.metrics]
+    return _make_markdown_table(
+        ["variant", *(["compared with"] if several else []), "seeds", *columns], lines
+    )
 
 
-def _describe_cell(cell: Cell, metric: str) -> str:
-    """Return a mean, with its difference from the control and the verdict in parentheses."""
+def _make_column_heading(source: KeptTable, metric: str) -> str:
+    """Return a metric's heading, with the jitter of the true motion, and with what a ratio compares."""
+    head = make_heading(metric)
+    if metric == "Jitter" and (truths := _find_true_jitter(source)):
+        return head.replace("]", f"; truth {' or '.join(truths)}{' by test clips' * (len(truths) > 1)}]")
+    return head.replace(RATIO, "step time / fixed network's") if metric == RATIO else head
+
+
+def _find_true_jitter(source: KeptTable) -> list[str]:
+    """Return the jitter of the true motion, one number for each set of test clips."""
+    mode = source.table.modes[0]
+    branches = {row.branch for row in source.table.rows}
+    values = (run.get_value(mode, branch, "GT Jitter") for run in source.kept.all_runs for branch in branches)
+    return sorted({f"{value:.2f}" for value in values if value is not None})
+
+
+def _describe_cell(cell: Cell, metric: str, control: Cell | None = None) -> str:
+    """Return a mean, with its difference from the control and the verdict in parentheses.
+
+    If the control was tested on fewer clips, the mean over the shared clips is added.
+    """
     effect, mean = cell.effect, format_mean(cell, metric)
     if cell.mean is None or effect is None or (metric in COSTS and cell.paper is None):
         return mean
     difference, *ratio = format_effect(cell, metric)
     if metric in COSTS:
         return " ".join([mean, *ratio])
+    if control and control.mean is not None and effect.clips == control.clips < cell.clips:
+        mean = f"{mean}; shared clips: {control.mean + effect.mean:.2f}"
     return f"{mean} ({' '.join(filter(None, [difference.strip('*'), effect.verdict]))})"
 
 
-def _make_series_table(table: Table) -> str:
+def _make_series_table(source: KeptTable) -> str:
     """Return the first metric of a sweep with axes: a line for each point, a column for each series."""
+    table = source.table
     mode, metric = table.modes[0], table.metrics[0]
     series = list(dict.fromkeys(row.series for row in table.rows))
     points: dict[str, dict[str, Row]] = {}
     for row in table.rows:
         points.setdefault(row.label.removeprefix(row.series).lstrip(", "), {})[row.series] = row
+    keys = list(dict.fromkeys(key for point in points for key in _parse_point(point)))
     lines = []
     for point, rows in points.items():
         seeds = {f"{len(row.found)}/{len(row.wanted)}" for row in rows.values()}
         cells = [
             _describe_point(rows[one].cells[mode][metric], metric) if one in rows else "" for one in series
         ]
-        short_point = escape_markdown(re.sub(r"[\w.]+\.(\w+=)", r"\1", point))
-        lines.append([short_point, ", ".join(sorted(seeds)), *cells])
-    heads = ["point", "seeds", *map(escape_markdown, series)]
-    return f"{make_heading(metric)}:\n\n{_make_markdown_table(heads, lines)}"
+        values = _parse_point(point)
+        lines.append([*(values.get(key, "") for key in keys), ", ".join(sorted(seeds)), *cells])
+    marked = {row.series for row in table.rows if row.confounded}
+    names = [f"{one} {CONFOUNDED}" if one in marked else one for one in series]
+    heads = [*keys, "seeds", *names]
+    return (
+        f"{make_heading(metric)}:\n\n{_make_markdown_table([escape_markdown(one) for one in heads], lines)}"
+    )
+
+
+def _parse_point(point: str) -> dict[str, str]:
+    """Return the values of a point's keys, by the last part of each key."""
+    pairs = (text.partition("=") for text in point.split(", "))
+    return {key.rpartition(".")[2]: escape_markdown(value) for key, _, value in pairs}
 
 
 def _describe_point(cell: Cell, metric: str) -> str:
@@ -217,6 +268,7 @@ def _list_number_remarks(table: Table) -> list[str]:
     """Return the flags about the numbers, not those about the origin of the runs, and remarks on variants."""
     about_origin = ("code ", "made ", "digest ", "component version", "size", "networks that")
     flags = [one for one in table.flags if " differs: " not in one and not one.startswith(about_origin)]
+    flags = [one.partition("; fill with: ")[0] for one in flags]  # the command is above the table
     return [*flags, *(f"{row.label}: {row.note}" for row in table.rows if row.note)]
 
 
@@ -231,8 +283,11 @@ def _list_all_remarks(source: KeptTable) -> dict[str, object]:
 
 def make_command(kept: KeptResults) -> str:
     """Return the command that repeats kept runs, or measures the same untrained networks again."""
+    if kept.rounds:
+        return f"{kept.command} --until-decided"
     if kept.run_count > kept.untrained_count:
-        return kept.command
+        seeds = sorted({seed for by_seed in kept.runs.values() for seed in by_seed})
+        return f"{kept.command} seed={','.join(map(str, seeds))}"
     return f"{kept.command} --untrained".replace("sweep", "table", 1)
 
 
@@ -293,15 +348,19 @@ class Placeholders:
         total = [self._count_claims(map(self._find_table, names), mode, one) for one in BRANCHES]
         return _make_markdown_table(heads, [*lines, ["all", *total]])
 
-    def decisions(self, names: Sequence[str], verdict: str, mode: str = "stream") -> str:
-        """Return the effects with a verdict such as `holds`, in the branch that the paper prints."""
+    def decisions(
+        self, names: Sequence[str], verdict: str, mode: str = "stream", confounded: bool = False
+    ) -> str:
+        """Return the effects with a verdict such as `holds`, in the branch that the paper prints.
+
+        They are those of rows that are not confounded, or only of confounded rows.
+        """
         found: dict[str, list[str]] = {}
         for name in names:
             table = self._find_table(name)
             for row, metric, cell, effect in table.list_effects(mode):
-                if effect.verdict == verdict and cell.paper_effect:
-                    mark = f" {CONFOUNDED}" if row.confounded else ""
-                    found.setdefault(f"Table {table.number} '{row.label}'{mark}", []).append(metric)
+                if effect.verdict == verdict and cell.paper_effect and bool(row.confounded) == confounded:
+                    found.setdefault(f"Table {table.number} '{row.label}'", []).append(metric)
         return escape_markdown("; ".join(f"{row}: {', '.join(metrics)}" for row, metrics in found.items()))
 
     def overview(self, *patterns: str) -> str:
@@ -324,19 +383,23 @@ class Placeholders:
             link = f"[{escape_markdown(caption)}]({name}.md)"
             numbers = [str(source.kept.run_count), " to ".join(map(str, sorted({*seeds[:1], *seeds[-1:]})))]
             lines.append([link, *numbers, self._count_significant(source.table), coarse])
-        heads = ["page", "runs", "seeds", "significant differences", "with a group for each content"]
+        heads = ["page", "runs", "seeds", "significant differences", "the same with styles joined"]
         return _make_markdown_table(heads, lines)
 
-    def leaders(self, name: str, metric: str, cost: str, mode: str = "stream") -> str:
-        """Return the variants that no other one beats in both a metric and a cost, with both numbers."""
-        rows = [row for row in self._find_table(name).rows if row.found and cost in row.costs]
+    def leaders(self, names: Sequence[str], metric: str, cost: str, mode: str = "stream") -> str:
+        """Return the variants of some tables that no other one beats in both a metric and a cost."""
+        known = []
+        for row in (row for name in names for row in self._find_table(name).rows):
+            cells = row.cells[mode]
+            number = cells[cost].mean if cost in cells else row.costs.get(cost)
+            if number is not None and (mean := cells[metric].mean) is not None:
+                known.append((number, mean, row))
         best, texts = float("inf"), []
-        for row in sorted(rows, key=lambda row: row.costs[cost]):
-            cell = row.cells[mode][metric]
-            if cell.mean is not None and cell.mean < best:
-                best = cell.mean
+        for price, mean, row in sorted(known, key=lambda one: one[:2]):
+            if mean < best:
+                best, cell = mean, row.cells[mode][metric]
                 number = f"{format_mean(cell, metric)} {find_unit(metric)}"
-                texts.append(f"{row.label} {number} ({row.costs[cost]:.2g})")
+                texts.append(f"'{row.label}' {number} ({price:.2g})")
         return escape_markdown(join_first(texts))
 
     def _count_claims(self, tables: Iterable[Table], mode: str, branch: str) -> str:

@@ -62,7 +62,7 @@ def test_a_page_has_each_mean_and_its_file_every_number(sweep: Sweep, kept: Kept
     assert {branch for *_, branch, _ in lines} > {"rotation", "position"}
     remarks = json.loads(files["tables/remarks.json"])["t"]
     assert "commit 0123456" in remarks["origin"]
-    assert remarks["command"] == "memmlp sweep table14 data=mocap"
+    assert remarks["command"] == "memmlp sweep table14 data=mocap seed=0,1,2"
 
 
 def test_what_holds_of_the_paper_is_counted(sweep: Sweep, kept: KeptResults):
@@ -93,13 +93,27 @@ def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResult
     costs[1] = 9  # the largest cost
     rows = [replace(row, costs={"ms": cost}) for row, cost in zip(made.table.rows, costs, strict=True)]
     made = made._replace(table=replace(made.table, rows=tuple(rows)))
-    text = fill('{{ leaders("t", "MPJPE", "ms") }}', made)
+    text = fill('{{ leaders(["t"], "MPJPE", "ms") }}', made)
     better = [
         all(one == two or errors[two] > errors[one] or costs[two] > costs[one] for two in range(len(rows)))
         for one in range(len(rows))
     ]
     assert 1 < sum(better) < len(rows)
     assert [f"({cost:.2g})" in text for cost in costs] == better
+    assert fill('{{ leaders(["t", "t"], "MPJPE", "ms") }}', made) == text
+
+
+def test_a_mean_over_more_clips_than_the_controls_has_the_shared_clips_beside_it(
+    sweep: Sweep, kept: KeptResults
+):
+    made = source(sweep, kept)
+    row = next(row for row in made.table.rows if row.label == "2")
+    control = next(one for one in made.table.rows if one.label == row.against).cells["stream"]["MPJPE"]
+    cell = row.cells["stream"]["MPJPE"]
+    assert "shared clips" not in make_pages({"t": made}, {})["t.md"]
+    row.cells["stream"]["MPJPE"] = replace(cell, clips=cell.clips + 5, counted=cell.counted + 5)
+    shared = f"; shared clips: {control.mean + cell.effect.mean:.2f} ("
+    assert make_pages({"t": made}, {})["t.md"].count(shared) == 1
 
 
 def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Sweep, kept: KeptResults):

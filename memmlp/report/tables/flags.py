@@ -192,16 +192,17 @@ def _flag_other_data(sweep: Sweep) -> Iterator[str]:
 def _flag_missing_runs(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, describe_run: DescribeRun
 ) -> Iterator[str]:
-    lacking: dict[str, str] = {}
+    lacking: dict[str, list[str]] = defaultdict(list)
     for variant in sweep.list_runnable():
         if seeds := find_missing_seeds(sweep, variant, runs):
             states = drop_repeats(text for seed in seeds if (text := describe_run(variant, seed)))
             described = f" ({', '.join(states)})" if states else ""
-            lacking[variant.label] = f"seed {', '.join(map(str, seeds))}{described}"
-    alike = 1 < len(sweep.list_runnable()) == len(lacking) and len(set(lacking.values())) == 1
+            lacking[f"seed {', '.join(map(str, seeds))}{described}"].append(variant.label)
     if lacking:
-        gaps = join_first([f"'{label}' {gap}" for label, gap in lacking.items()])
-        gaps = f"every variant's {next(iter(lacking.values()))}" if alike else gaps
+        gap, labels = next(iter(lacking.items()))
+        alike = 1 < len(sweep.list_runnable()) == len(labels)
+        gaps = join_first([f"{join_quoted(labels)} {gap}" for gap, labels in lacking.items()])
+        gaps = f"every variant's {gap}" if alike else gaps
         yield f"missing: {gaps}; fill with: {command}"
 
 
@@ -244,7 +245,7 @@ def _flag_unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterato
         if len(shared) < len(every) and runs[variant.label] and runs[other.label]:
             yield (
                 f"unequal test clips: '{variant.label}' and '{other.label}' share {len(shared)} of "
-                f"{len(every)}; only those are compared, the means are over all"
+                f"{len(every)}; only those are compared"
             )
 
 
@@ -440,9 +441,10 @@ def _flag_missing_replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> It
     one_seed = max(map(len, measured.values())) == 1
     one_group = max(len({run.get_group(clip) for clip in run.clips}) for run in every) == 1
     if one_seed and one_group:
-        yield "one seed a variant and one group of test clips: no interval and no star"
+        yield "one seed a variant and one group of test clips: no interval, and nothing is significant"
     elif one_seed:
-        yield "one seed a variant: the intervals are about other clips, not about other seeds; no star"
+        about = "the intervals are about other clips, not about other seeds"
+        yield f"one seed a variant: {about}, and nothing is significant"
     else:
         shared = {
             one.label: len(runs[one.label].keys() & runs[two.label].keys())
@@ -451,7 +453,7 @@ def _flag_missing_replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> It
         few = [label for label, number in shared.items() if number == 1]
         if few:
             interval = "no interval" if one_group else "an interval about other clips alone"
-            yield f"one seed, so {interval} and no star: {join_quoted(few)}"
+            yield f"one seed, so {interval}, and nothing is significant: {join_quoted(few)}"
 
     def count_single_clips(run: MeasuredRun) -> int:
         return list(Counter(map(run.get_group, run.clips)).values()).count(1)

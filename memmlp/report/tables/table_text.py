@@ -195,9 +195,13 @@ def describe_power(table: Table, mode: str) -> str:
     but = f" but {', '.join(map(repr, blind))}" if blind else ""
     texts = []
     if found:
-        texts.append(f"with 80 % power, every variant{but} shows a true difference of {', '.join(found)}")
+        texts.append(
+            f"smallest difference that every variant{but} detects with 80 % power: {', '.join(found)}"
+        )
     if lost:
-        texts.append(f"too few seeds to find even a difference as large as the values: {', '.join(lost)}")
+        texts.append(
+            f"at least one variant cannot detect even a difference as large as its error in {', '.join(lost)}"
+        )
     return "; ".join(texts)
 
 

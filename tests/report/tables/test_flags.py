@@ -393,7 +393,7 @@ def test_variants_that_share_a_single_seed(sweep: Sweep, tmp_path: Path):
         sweep, lambda variant, seed: find(variant, seed) if seed in kept.get(variant.label, (1, 2)) else None
     )
     (line,) = (flag for flag in table.flags if flag.startswith("one seed"))
-    assert line.endswith("about other clips alone and no star: 'no | memory', 'by position'")
+    assert line.endswith("about other clips alone, and nothing is significant: 'no | memory', 'by position'")
 
 
 def test_seeds_that_share_a_vqvae(flags: Callable[..., list[str]]):
