@@ -391,9 +391,9 @@ class Placeholders:
         known = []
         for row in (row for name in names for row in self._find_table(name).rows):
             cells = row.cells[mode]
-            number = cells[cost].mean if cost in cells else row.costs.get(cost)
-            if number is not None and (mean := cells[metric].mean) is not None:
-                known.append((number, mean, row))
+            price = cells[cost].mean if cost in cells else row.costs.get(cost)
+            if price is not None and (mean := cells[metric].mean) is not None:
+                known.append((price, mean, row))
         best, texts = float("inf"), []
         for price, mean, row in sorted(known, key=lambda one: one[:2]):
             if mean < best:
