@@ -15,8 +15,8 @@ def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | No
     """Perform the tasks of the plan in a file. `threads` is the number of torch's threads if the config does
     not set it; 0 for torch's default. `controller` is the file of the controller's `Presence`; the worker
     ends with it. A worker without it, on another machine, finishes a closed plan, and leaves an open plan
-    when the controller no longer touches the plan's file. Return a line that explains why a worker that needs
-    a `gpu` has none and did nothing; else None."""
+    when the controller no longer touches the plan's file. If a worker needs a `gpu` and
+    finds no GPU, it does nothing and returns a line that says why; otherwise return None."""
     if gpu:
         from memmlp.training import devices  # it imports torch
 

@@ -113,7 +113,7 @@ def read_amc(path: Path) -> AsfAmc:
 
 def find_asf(path: Path) -> Path:
     """Find the skeleton of a take: an ASF file in the same folder, such as `05.asf` for `05_01.amc`. Raises
-    InputError if there is none."""
+    InputError without such a file."""
     files = [file for file in path.parent.glob("*") if file.suffix.lower() == ".asf"]
     matches = [file for file in files if path.stem.lower().startswith(f"{file.stem}_".lower())]
     if not matches:

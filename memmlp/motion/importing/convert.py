@@ -146,7 +146,7 @@ class Retargeting:
 
 def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotion) -> Stance:
     """Find the stance of a file: the rest pose in the map, else the zero pose, else the straightest frame.
-    Raises InputError if the file has none of these, or if left and right contradict each other."""
+    Raises InputError if the file has no such pose, or if left and right contradict each other."""
     upright, positions, path = skeleton.upright, motion.positions, recording.path
     stands = (why := anatomy.find_stance_fault(motion.zero)) is None
 

@@ -55,7 +55,7 @@ class TooShortError(InputError):
 
 
 def survey_folder(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
-    """Read every npz file below a folder. Raises InputError if there is none, or if `strict` is set and a
+    """Read every npz file below a folder. Raises InputError without such files, or if `strict` is set and a
     file is bad."""
     clips: dict[str, ClipRecord] = {}
     firsts: dict[str, np.ndarray] = {}
