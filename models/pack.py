@@ -1,8 +1,12 @@
 """Pack a finished run as a shipped network, or cut the shipped clip. A maintainer's script, not a command.
 
-    python models/pack.py network RUN NAME --root DATA --title TITLE --command COMMAND
+    python models/pack.py network NAME RUN... --root DATA --title TITLE --command COMMAND
     python models/pack.py latency NAME    # time the network again, on a quiet machine
     python models/pack.py clip FILE.npz --start SECONDS --seconds SECONDS
+
+Of several runs, the one with the lowest validation MPJPE is packed; the card lists all. Test persons are
+measured after this choice. The trainings to choose from, fixed before the first of them was run: 5 and 20
+TFLOP, each with data.mirror=false and true.
 
 Weight matrices are rounded to float16, so that the wheel is small. Then the rounded network is exported and
 measured again: the card describes the shipped files.
@@ -200,11 +204,26 @@ def make_card(opened: OpenedRun, title: str, command: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def pack_network(run_name: str, name: str, root: Path, outputs: Path, title: str, command: str) -> None:
-    """Pack a run; print its card."""
-    run = find_run(outputs, run_name)
-    opened = measure(copy_run(run, name), root, outputs)
-    card = make_card(opened, title, command)
+def find_validation_error(run: Run) -> float:
+    """Return the lowest validation MPJPE (cm) of the branch that decides which weights are kept."""
+    branch = run.config["optim"]["best_by"]
+    rows = [json.loads(line) for line in run.metrics_path.read_text().splitlines()]
+    return min(row["values"][f"{branch} MPJPE"] for row in rows if row["phase"] == "val")
+
+
+def pack_network(names: list[str], name: str, root: Path, outputs: Path, title: str, command: str) -> None:
+    """Pack the run with the lowest validation error; print its card."""
+    runs = sorted((find_run(outputs, each) for each in names), key=find_validation_error)
+    candidates = [
+        {
+            "tflop": round(run.manifest["tflop"], 2),
+            "mirror": run.config["data"]["mirror"],
+            "validation MPJPE": round(find_validation_error(run), 3),
+        }
+        for run in runs
+    ]
+    opened = measure(copy_run(runs[0], name), root, outputs)
+    card = {**make_card(opened, title, command), "candidates": candidates}
     (MODELS / name / CARD).write_text(json.dumps(card, indent=1) + "\n")
     print(json.dumps(card, indent=1))
 
@@ -226,8 +245,8 @@ def main() -> None:
     kinds = parser.add_subparsers(dest="kind", required=True)
     network, clip, latency = (kinds.add_parser(kind) for kind in ("network", "clip", "latency"))
     latency.add_argument("name")
-    network.add_argument("run")
     network.add_argument("name")
+    network.add_argument("runs", nargs="+")
     network.add_argument("--root", type=Path, required=True)
     network.add_argument("--outputs", type=Path, default=Path("outputs"))
     network.add_argument("--title", required=True)
@@ -241,7 +260,7 @@ def main() -> None:
     elif given.kind == "latency":
         measure_latency(given.name)
     else:
-        pack_network(given.run, given.name, given.root.resolve(), given.outputs, given.title, given.command)
+        pack_network(given.runs, given.name, given.root.resolve(), given.outputs, given.title, given.command)
 
 
 if __name__ == "__main__":
