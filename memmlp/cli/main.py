@@ -37,7 +37,7 @@ COMMANDS = {
     "sweep": Command("sweep", "sweep", "Run the missing runs of a table or of your own sweep.", True),
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the validation errors.", True),
     "table": Command("table", "table", "Show the paper's tables beside measured numbers."),
-    "results": Command("results", "results", "Keep results of runs with the code; make pages from them."),
+    "results": Command("results", "results", "Keep results of runs in small files; show their tables."),
     "report": Command("ui", "report", "Write the page of `memmlp ui` as one HTML file."),
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
     "loggers": Command("loggers", "loggers", "Add runs to MLflow, TensorBoard or W&B."),

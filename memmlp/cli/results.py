@@ -1,11 +1,10 @@
-"""`memmlp results`: keep results of runs with the code, and make pages from these results."""
+"""`memmlp results`: keep the results of runs in small files, and show their tables."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,6 @@ from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
     from memmlp.report.kept_results import KeptResults
-    from memmlp.report.result_pages import KeptTable
     from memmlp.report.tables.table import Table
 
 FOLDER = Path("docs/results")
@@ -31,7 +29,7 @@ FOLDER = Path("docs/results")
 
 @click.group("results")
 def results() -> None:
-    """Keep the results of runs with the code, and make pages from these results."""
+    """Keep the results of runs in small files, and show their tables."""
 
 
 @results.command("save")
@@ -97,21 +95,13 @@ def save_command(
     click.echo(f"{path}: {kept.run_count} runs")
 
 
-folder_option = click.option(
-    "--folder",
-    type=HomePath(file_okay=False),
-    default=FOLDER,
-    help="Folder of the pages, with the subfolders data and templates.",
-)
-
-
 @results.command("show")
 @click.argument("name", metavar="NAME")
 @source_option
 @together_option
-@folder_option
+@click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Folder above data/.")
 def show(name: str, source: str | None, together: tuple[str, ...], folder: Path) -> None:
-    """Print the table of kept results. NAME is the name of their page; no run is needed."""
+    """Print the table of kept results. NAME is the name of their file; no run is needed."""
     from memmlp.cli.table import print_tables
     from memmlp.report.kept_results import load_kept_results
 
@@ -119,64 +109,10 @@ def show(name: str, source: str | None, together: tuple[str, ...], folder: Path)
     if not path.is_file():
         names = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
         raise InputError(f"{path}: no such results; must be one of: {names or '(nothing is kept)'}")
-    print_tables([_make_table(load_kept_results(path), source, together)])
+    print_tables([make_kept_table(load_kept_results(path), source, together)])
 
 
-@results.command("docs")
-@folder_option
-@click.option("--check", is_flag=True, help="Write nothing; exit with 1 if a page differs.")
-def docs(folder: Path, check: bool) -> None:
-    """Make all pages and CSV files of results from the kept results, without training.
-
-    Each file in data/ becomes a short page with a table, and a CSV file in tables/ with all numbers. Each
-    template becomes a page with numbers and verdicts from these tables.
-    """
-    from memmlp.common.files import atomic_write
-    from memmlp.report.result_pages import FILES, MARK, draw_pictures, make_pages
-
-    templates = {path.name: path.read_text(encoding="utf-8") for path in (folder / "templates").glob("*.md")}
-    tables = make_tables(folder)
-    made = make_pages(tables, templates)
-    paths = [*folder.glob("*.md"), *(folder / FILES).glob("*")]
-    present = {str(path.relative_to(folder)): path.read_bytes().decode("utf-8", "replace") for path in paths}
-    differing = [name for name, text in made.items() if present.get(name) != text]
-    old = present.keys() - made.keys()
-    stale = sorted(name for name in old if present[name].startswith(MARK) or name.startswith(f"{FILES}/"))
-    if check:
-        for name in [*differing, *stale]:
-            update = "differs from the kept results; update it with: memmlp results docs"
-            click.echo(f"{folder / name}: {update}", err=True)
-        if differing or stale:
-            raise SystemExit(1)
-    else:
-        (folder / FILES).mkdir(exist_ok=True)
-        for name in differing:
-            atomic_write(folder / name, made[name])
-        for name, picture in draw_pictures(tables).items():  # its bytes differ between matplotlib's versions
-            if name.replace("_frontier.svg", ".md") in differing or not (folder / name).exists():
-                atomic_write(folder / name, picture)
-        for name in stale:
-            (folder / name).unlink()
-    click.echo(f"{folder}: {len(made)} files, {len(differing)} {'differ' if check else 'written'}")
-
-
-def make_tables(folder: Path) -> dict[str, KeptTable]:
-    """Return the tables of all kept results in a folder, by file stem."""
-    from memmlp.report.kept_results import load_kept_results
-    from memmlp.report.result_pages import KeptTable
-
-    if not (folder / "data").is_dir():
-        raise InputError(f"{folder}/data: no such folder; memmlp results save --out {folder}/data makes it")
-    tables = {}
-    for path in sorted((folder / "data").glob("*.json")):
-        kept = load_kept_results(path)
-        sources = () if kept.rounds else kept.sources  # verdicts by seed rounds need all clips
-        by_source = tuple(_make_table(kept, source) for source in sources)
-        tables[path.stem] = KeptTable(kept, _make_table(kept), by_source, partial(_make_table, kept, None))
-    return tables
-
-
-def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
+def make_kept_table(kept: KeptResults, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
     """Compute the table of kept results for the sweep's seeds and all additional seeds with runs. With
     `source`, only its test clips count. Test clips form one group if a pattern matches the same text in their
     names."""
@@ -209,32 +145,3 @@ def _make_table(kept: KeptResults, source: str | None = None, patterns: Sequence
     if changed:
         flags.append(f"made with earlier component versions: {', '.join(changed)}")
     return replace(table, flags=(*table.flags, *kept.flags, *flags))
-
-
-@results.command("searches")
-@click.argument("folders", nargs=-1, type=HomePath(exists=True, file_okay=False))
-@click.option(
-    "--out",
-    type=HomePath(file_okay=False),
-    default=Path("searches"),
-    help="Folder for trials.csv and summary.md.",
-)
-@outputs_option
-def searches(folders: tuple[Path, ...], out: Path, outputs: Path) -> None:
-    """Write the trials and the best trials of finished searches.
-
-    FOLDERS are those of searches; by default, all finished searches below the outputs folder. trials.csv has
-    a row for each trial, summary.md a row for each search.
-    """
-    from memmlp.common.files import atomic_write
-    from memmlp.sweep.search.earlier_searches import FinishedSearch, format_summary, format_trials
-
-    chosen = folders or sorted(path.parent for path in (outputs / "tune").glob("*/trials.csv"))
-    if not chosen:
-        raise InputError(f"{outputs / 'tune'}: has no finished searches; run memmlp tune")
-    found = [FinishedSearch(folder.absolute()) for folder in chosen]
-    out.mkdir(parents=True, exist_ok=True)
-    atomic_write(out / "trials.csv", format_trials(found))
-    summary = "\n".join(format_summary(found))
-    atomic_write(out / "summary.md", f"{summary}\n")
-    click.echo(summary)

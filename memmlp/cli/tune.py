@@ -87,8 +87,7 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     from memmlp.common.files import digest
     from memmlp.config.compose import compose_plain
     from memmlp.config.plugins import activate, find_named_packages
-    from memmlp.sweep.search.earlier_searches import FinishedSearch
-    from memmlp.sweep.search.search_file import Search, parse_search
+    from memmlp.sweep.search.search_file import Search, parse_search, read_best_trial
 
     activate(find_named_packages(overrides))
     own = [text for text in overrides if Override.parse(text).group == "search"]
@@ -100,9 +99,8 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
     _complete_kinematic_loss(content, [*(content.get("base") or ()), *remaining])
     best: dict[str, Value] = {}
     if isinstance(folder := content.get("after"), str):
-        earlier = FinishedSearch(Path(folder))
-        best = earlier.best_values
-        content["base"] = [*earlier.overrides, *Search.overrides(best), *(content.get("base") or ())]
+        overrides_before, best = read_best_trial(Path(folder))
+        content["base"] = [*overrides_before, *Search.overrides(best), *(content.get("base") or ())]
     parsed = parse_search(content, best)
     setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
     base = _check_space(setup)

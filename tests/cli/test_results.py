@@ -1,4 +1,4 @@
-"""`memmlp results`: what it keeps, makes and refuses."""
+"""`memmlp results`: what it keeps, shows and refuses; and the pages made from it."""
 
 import json
 from pathlib import Path
@@ -6,24 +6,36 @@ from pathlib import Path
 import pytest
 from conftest import Memmlp, one_line
 
+from docs.results.make_pages import update
+from memmlp.common.errors import InputError
 
-def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
+PAGES = Path("docs/results")
+
+
+def make_pages(check: bool = False) -> int:
+    return update(PAGES, check)
+
+
+def test_kept_results_become_pages(memmlp: Memmlp, planned: None, capsys: pytest.CaptureFixture):
     assert "table14.json: 4 runs" in memmlp("results", "save", "14", "seed=0").out
     assert "table14.json: 12 runs" in memmlp("results", "save", "14").out
     assert one_line(memmlp("results", "save", "14", "seed=0"), "table14.json", "seed 1", "--name")
     templates = Path("docs/results/templates")
     templates.mkdir()
     (templates / "README.md").write_text('{{ claims(["table14"]) }}\n')
-    assert memmlp("results", "docs", "--check").code == 1
-    assert memmlp("results", "docs").out == "docs/results: 4 files, 4 written\n"
-    assert memmlp("results", "docs", "--check").out == "docs/results: 4 files, 0 differ\n"
+    capsys.readouterr()
+    assert make_pages(check=True) == 1
+    assert (make_pages(), make_pages(check=True)) == (0, 0)
+    words = ("4 differ", "4 written", "0 differ")
+    assert capsys.readouterr().out == "".join(f"docs/results: 4 files, {each}\n" for each in words)
     assert Path("docs/results/table14.md").read_text().count("| 3/3 |") == 4
     assert " inconclusive" in Path("docs/results/README.md").read_text()
     for path in (Path("docs/results/table14.md"), Path("docs/results/tables/table14.csv")):
         text = path.read_text()
         path.write_text(text.replace("inconclusive", "holds", 1))
-        assert f"{path}: differs" in memmlp("results", "docs", "--check").err
-        memmlp("results", "docs")
+        assert make_pages(check=True) == 1
+        assert f"{path}: differs" in capsys.readouterr().err
+        make_pages()
         assert path.read_text() == text
 
 
@@ -39,22 +51,22 @@ def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
 
 def test_one_kept_seed_of_three_is_no_finished_table(memmlp: Memmlp, planned: None):
     memmlp("results", "save", "14", "seed=1")
-    memmlp("results", "docs")
+    make_pages()
     page = Path("docs/results/table14.md")
     assert (page.read_text().count("| 1/3 |"), page.read_text().count("| 1/1 |")) == (4, 0)
     assert "missing: every variant's seed 0, 2\n" in page.read_text()
     memmlp("results", "save", "14", "seed=0,1,2,3")
-    memmlp("results", "docs")
+    make_pages()
     assert page.read_text().count("| 4/4 |") == 4
 
 
 def test_pages_without_data_go(memmlp: Memmlp, planned: None):
     memmlp("results", "save", "14", "--name", "small")
-    memmlp("results", "docs")
+    make_pages()
     Path("docs/results/notes.md").write_text("by hand\n")
     Path("docs/results/data/small.json").unlink()
-    assert "small.md" in memmlp("results", "docs", "--check").err
-    memmlp("results", "docs")
+    assert make_pages(check=True) == 1
+    make_pages()
     left = {str(path) for path in Path("docs/results").rglob("*.*")}
     assert left == {"docs/results/notes.md"}
 
@@ -64,7 +76,7 @@ def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None
     memmlp("results", "save", "./mine.yaml", "x=/data/here")
     content = json.loads(Path("docs/results/data/mine.json").read_text())
     assert (content["sweep"], content["overrides"]) == ("./mine.yaml", ["x=.../here"])
-    assert memmlp("results", "docs").code == 0
+    assert make_pages() == 0
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -73,14 +85,12 @@ def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None
     (["save", "14", "optim.lr=1"], ("table14.json", "memmlp sweep table14 optim.lr=1", "--name")),
     (["save", "14", "--out", "/proc/no"], ("/proc/no",)),
     (["show", "15"], ("data/15.json", "must be one of: table14")),
-    (["docs", "--folder", "elsewhere"], ("elsewhere/data", "--out elsewhere/data")),
 ])  # fmt: skip
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):
     memmlp("results", "save", "14")
     assert one_line(memmlp("results", *arguments), *words)
 
 
-def test_finished_searches_are_needed(memmlp: Memmlp):
-    assert one_line(memmlp("results", "searches"), "outputs/tune: has no finished searches")
-    Path("other").mkdir()
-    assert one_line(memmlp("results", "searches", "other"), "other: must be the folder of a finished search")
+def test_pages_need_a_folder_of_results(tmp_path: Path):
+    with pytest.raises(InputError, match=r"data: no such folder; .*--out"):
+        update(tmp_path, check=False)

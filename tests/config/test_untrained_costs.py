@@ -8,8 +8,6 @@ from fake_runs import fake_run
 
 from memmlp.config.build import build_untrained
 from memmlp.config.untrained_costs import measure_untrained_variants
-from memmlp.report.kept_results import KeptResults
-from memmlp.report.result_pages import describe_origin
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.sweep.sweep_file import parse_sweep
@@ -34,12 +32,6 @@ def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: 
     assert found.costs["size"] > 4 * found.costs["parameters"]
     table = make_table(SWEEP, runs)
     assert not [flag for flag in table.flags if "not evaluated" in flag or "missing" in flag]
-    (alone, beside) = (
-        describe_origin(KeptResults("sizes", ("profile=tiny",), found, {}))
-        for found in ({"AvatarPoser": runs["AvatarPoser"]}, runs)
-    )
-    assert "--untrained" in alone
-    assert "1 run and 1 untrained network" in beside
 
 
 def test_the_command_refuses_it_for_other_tables(memmlp: Memmlp):

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from memmlp.cli.results import make_tables
+from docs.results.make_pages import KeptTable, make_pages, make_tables
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
-from memmlp.report.result_pages import KeptTable, make_pages
 from memmlp.report.tables.build_table import group_clips, make_table
 from memmlp.report.tables.statistics import Verdict, estimate_error
 from memmlp.sweep.definition import Sweep

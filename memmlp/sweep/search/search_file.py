@@ -29,12 +29,17 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import format_value
+from memmlp.common.schema import parse_config_yaml
 from memmlp.common.settings import Rule, matching, one_of, positive
+from memmlp.common.text_formats import parse_csv
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
+from memmlp.runs import records
+from memmlp.runs.records import SearchRecord
 
 OBJECTIVE_BRANCHES = ("rotation", "position")
 RANGE_KEYS = ("low", "high", "log", "step", "choices", "first", "factor")
@@ -332,3 +337,29 @@ def _parse_number(value: Any, name: str) -> float | int:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{name}: {'nothing' if value is None else value}; expected a number")
     return value
+
+
+def read_best_trial(folder: Path) -> tuple[tuple[str, ...], dict[str, Value]]:
+    """Return the overrides of all trials of a finished search, and the values of its best trial by key.
+
+    Raises:
+        InputError: if the folder has no finished search, a damaged one, or one without a complete trial.
+    """
+    record, path = folder / "search.json", folder / "trials.csv"
+    if damage := records.find_damage(record, SearchRecord):
+        raise InputError(damage)
+    content = records.read(record, SearchRecord)
+    if "command_line" not in content or not path.is_file():
+        raise InputError(
+            f"{folder}: must be the folder of a finished search, with search.json and trials.csv"
+        )
+    objective, keys = content["objectives"][0]["text"], [one["key"] for one in content["space"]]
+    try:
+        trials = [row for row in parse_csv(path.read_text(encoding="utf-8")) if row["state"] == "complete"]
+        best = min(trials, key=lambda row: float(row[objective]), default=None)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: must be the trials of a search ({error})") from None
+    if best is None:
+        raise InputError(f"{folder}: no trial is complete; expected a search with a best trial")
+    overrides = (*content["base"], *content["command_line"])
+    return overrides, {key: parse_config_yaml(text) for key in keys if (text := best[key])}

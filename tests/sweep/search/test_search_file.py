@@ -1,11 +1,17 @@
 """Searches from configs: what is refused, and what objectives and ranges mean."""
 
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_search import SPACE, finish, open_study, search, seeded
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.search.search_file import Range, parse_search
+from memmlp.common.files import write_json
+from memmlp.common.text_formats import parse_csv
+from memmlp.sweep.search.results import write_trials
+from memmlp.sweep.search.search_file import Range, parse_search, read_best_trial
 
 GOOD: dict[str, Any] = {
     "name": "mine", "base": ["loss=manual"],
@@ -94,3 +100,59 @@ def test_what_is_wrong_is_named():
         assert words in str(caught.value), changes
     with pytest.raises(InputError, match=r"search\.n_trials: has no value"):
         parse_search({key: value for key, value in GOOD.items() if key != "n_trials"})
+
+
+def finished(home: Path, command_line: list[str], **changes) -> Path:
+    """A finished search below a folder of outputs."""
+    folder = home / "tune" / command_line[0].replace("=", "-")
+    folder.mkdir(parents=True)
+    study = open_study(folder, **changes)
+    director = seeded(study, home)
+    while (plan := director.update(2)).tasks:
+        finish(plan)
+    write_trials(study, folder / "trials.csv")
+    write_json(folder / "search.json", {**asdict(study.search), "command_line": command_line})
+    return folder
+
+
+def test_the_best_trial_with_all_its_overrides(tmp_path: Path):
+    folder = finished(tmp_path, ["model=rpm", "profile=tiny"], tflop=5)
+    rows = parse_csv((folder / "trials.csv").read_text())
+    best = min(rows, key=lambda row: float(row["MPJPE"]))
+    expected = {key: float(best[key]) for key in ("loss.rotation_all", "loss.hand")}
+    assert read_best_trial(folder) == (("loss=manual", "model=rpm", "profile=tiny"), expected)
+
+
+def test_a_folder_without_a_finished_search_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="must be"):
+        read_best_trial(tmp_path)
+
+
+def test_a_range_around_the_best_value():
+    ranges = {"loss": {**SPACE, "rotation_all": {"factor": 2}}}
+    made = search(space=ranges, best={"loss.rotation_all": 3.0})
+    one = next(one for one in made.space if one.key == "loss.rotation_all")
+    assert (one.low, one.high, one.log, one.first) == (1.5, 6.0, True, 3.0)
+    with pytest.raises(InputError, match="factor: needs search"):
+        search(space=ranges)
+
+
+def test_choices_of_a_group_beside_its_keys_and_choices_of_several_overrides():
+    many = "kinematic predictor=rotation_only hand=off"
+    ranges = {"optim": {"choices": ["adamw", "muon"], "lr": {"low": 0.1, "high": 1.0}}}
+    made = search(space=ranges | {"loss": {"choices": ["default", many]}})
+    assert [one.key for one in made.space] == ["optim.lr", "optim", "loss"]
+    assert made.overrides({"optim": "muon", "loss": "default"}) == ("optim=muon",)
+    assert made.overrides({"loss": many}) == ("loss=kinematic", "predictor=rotation_only", "hand=off")
+
+
+@pytest.mark.parametrize(("file", "old", "new"), [
+    ("search.json", '"objectives"', '"other"'), ("search.json", '"text": "', '"text": 5, "x": "'),
+    ("search.json", "{", "["), ("trials.csv", "state", "other"), ("trials.csv", "complete,", "complete,x"),
+])  # fmt: skip
+def test_a_damaged_search_is_one_line(tmp_path: Path, file: str, old: str, new: str):
+    folder = finished(tmp_path, ["model=rpm"], tflop=5)
+    path = folder / file
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=file):
+        read_best_trial(folder)

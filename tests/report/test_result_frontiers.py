@@ -9,10 +9,16 @@ from pathlib import Path
 import pytest
 from fake_runs import fake_run, table_of
 
+from docs.results.make_pages import (
+    KeptTable,
+    draw_frontiers,
+    draw_pictures,
+    has_frontier,
+    list_points,
+    make_pages,
+)
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
-from memmlp.report.pictures.frontier import draw_frontiers, has_frontier, list_points
-from memmlp.report.result_pages import KeptTable, draw_pictures, make_pages
 from memmlp.report.tables.table import Table
 from memmlp.sweep.sweep_file import parse_sweep
 

@@ -1,25 +1,39 @@
-"""Result pages: a short page, a CSV file and remarks for each kept table, and pages from templates."""
+"""Make the pages of results, from the results in data/ and the templates in templates/, without training.
+
+`python docs/results/make_pages.py` writes a short page, a CSV file and remarks for each table, and a page for
+each template. With --check it writes nothing, and exits with 1 if a page differs.
+"""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import itertools
 import json
+import sys
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
-from memmlp.common.errors import InputError, import_optional
-from memmlp.common.text_formats import escape_markdown
-from memmlp.report.kept_results import KeptResults
-from memmlp.report.pictures.frontier import draw_frontiers, has_frontier
+import jinja2
+
+from memmlp.cli.results import make_kept_table
+from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write
+from memmlp.common.text_formats import escape_markdown, format_csv
+from memmlp.report.kept_results import KeptResults, load_kept_results
 from memmlp.report.tables.flags import join_first, join_quoted
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table import Cell, Row, Table
+from memmlp.report.tables.table import Cell, Effect, Row, Table
 from memmlp.report.tables.table_text import (
     CONFOUNDED,
     MISSING,
+    add_unit,
     describe_branches,
     describe_power,
     find_unit,
@@ -30,11 +44,14 @@ from memmlp.report.tables.table_text import (
     list_remarks,
     make_caption,
     make_heading,
-    to_csv,
 )
 from memmlp.sweep.definition import COSTS
 
-MARK = "<!-- made by: memmlp results docs -->"
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+HERE = Path(__file__).parent
+MARK = "<!-- made by: docs/results/make_pages.py -->"
 FILES = "tables"  # folder of the CSV files and the remarks, below the folder of the pages
 MAX_REMARK = 160  # maximum length of a remark on a page, characters
 ORIGIN = {
@@ -308,7 +325,6 @@ def describe_origin(kept: KeptResults) -> list[str]:
 
 def _fill_template(name: str, text: str, placeholders: Mapping[str, object]) -> str:
     """Render a template. Raises InputError, which names the template."""
-    jinja2 = import_optional("jinja2", "plots", name)
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined, keep_trailing_newline=True, trim_blocks=True
     )
@@ -423,3 +439,208 @@ class Placeholders:
             choices = ", ".join(sorted(self.sources)) or "none"
             raise InputError(f"'{name}': results must be one of {choices}")
         return self.sources[name].table
+
+
+# All numbers as CSV
+
+CSV_HEADINGS = (
+    "test clips", "variant", "mode", "branch", "metric", "unit", "seeds", "planned seeds", "clips", "mean",
+    "sd", "low", "high", "compared with", "its branch", "difference", "difference low", "difference high",
+    "p", "corrected p", "equivalence p", "verdict", "decided at seeds", "detectable", "paper",
+    "paper difference", "confounded",
+)  # fmt: skip
+
+
+def to_csv(tables: Mapping[str, Table]) -> str:
+    """Return all numbers of tables as CSV: a line for each variant, mode, branch and metric.
+
+    Args:
+        tables: the tables by the test clips that they are about.
+    """
+    lines = (
+        [clips, *line]
+        for clips, table in tables.items()
+        for row in table.rows
+        for line in _list_numbers(table, row)
+    )
+    return format_csv([CSV_HEADINGS, *lines])
+
+
+def _list_numbers(table: Table, row: Row) -> Iterator[list[object]]:
+    """Yield a variant's lines of CSV: its metrics, its other costs, and its effects in other branches."""
+    seeds = [len(row.found), len(row.wanted)]
+    other = next((one.branch for one in table.rows if one.label == row.against), "")
+    for mode, cells in row.cells.items():
+        for metric, cell in cells.items():
+            if cell.values or cell.paper is not None:
+                head = ["", ""] if metric in COSTS else [mode, row.branch]
+                numbers = [cell.counted or "", cell.mean, cell.sd, cell.low, cell.high]
+                yield _make_csv_line(row, [*head, metric], [*seeds, *numbers], cell.effect, other, cell)
+    for name in (one for one in row.costs if one not in table.metrics):
+        unit = {"tflop": "TFLOP", "seconds": "s"}.get(name, find_unit(name))
+        line = [row.label, "", "", name, unit, *seeds, "", _shorten(row.costs[name])]
+        yield [*line, *[""] * (len(CSV_HEADINGS) - len(line) - 1)]
+    for branch, by_mode in row.branches.items():
+        for mode, metric, effect in ((m, key, one) for m in table.modes for key, one in by_mode[m].items()):
+            yield _make_csv_line(row, [mode, branch, metric], [*seeds, *[""] * 5], effect, branch)
+
+
+def _make_csv_line(
+    row: Row,
+    head: Sequence[str],
+    numbers: Sequence[object],
+    effect: Effect | None,
+    other: str,
+    cell: Cell | None = None,
+) -> list[object]:
+    names = ("mean", "low", "high", "p", "holm", "equal", "verdict", "decided", "detectable")
+    line = [row.label, *head, find_unit(head[-1]), *numbers, *((row.against, other) if effect else ("", ""))]
+    line += [getattr(effect, name) if effect else "" for name in names]
+    line += [cell.paper, cell.paper_effect] if cell else ["", ""]
+    return [_shorten(one) for one in (*line, row.confounded)]
+
+
+def _shorten(value: object) -> object:
+    """Return a number with five significant digits, and an empty text for None."""
+    return f"{value:.5g}" if isinstance(value, float) else "" if value is None else str(value)
+
+
+# Frontiers: error against training compute and latency
+
+COMPUTE, LATENCY = "tflop", "ms"
+MIN_RATIO = 1.1  # minimum ratio between two budgets of a frontier
+
+
+class Point(NamedTuple):
+    """A variant's place on a frontier.
+
+    Attributes:
+        series: the network, whose variants with other budgets are on the same curve.
+        label: the variant's label.
+        cost: training compute in TFLOP, or latency in ms.
+        mean, low, high: the error with its 95 % interval over seeds and clip groups; without an interval, all
+            are the mean.
+    """
+
+    series: str
+    label: str
+    cost: float
+    mean: float
+    low: float
+    high: float
+
+
+def has_frontier(table: Table) -> bool:
+    """Return whether the variants' training compute is known and differs."""
+    known = [row.costs[COMPUTE] for row in table.rows if COMPUTE in row.costs]
+    return bool(table.measured_metrics) and len(known) > 1 and max(known) > MIN_RATIO * min(known)
+
+
+def choose_metric(table: Table) -> str:
+    """Return MPJPE if the table has it, otherwise its first error metric."""
+    return "MPJPE" if "MPJPE" in table.measured_metrics else table.measured_metrics[0]
+
+
+def list_points(table: Table, cost: str) -> Iterator[Point]:
+    """Yield the places of the table's variants with a known cost, in its first mode, by series and cost."""
+    mode, metric = table.modes[0], choose_metric(table)
+    for row in sorted(table.rows, key=lambda row: (row.series, row.costs.get(cost, 0.0))):
+        cell = row.cells[mode][metric]
+        if cost in row.costs and cell.mean is not None:
+            low, high = (cell.mean if one is None else one for one in (cell.low, cell.high))
+            yield Point(row.series, row.label, row.costs[cost], cell.mean, low, high)
+
+
+SHIFT = 1.015  # ratio of neighbouring networks' places, so that intervals at one budget do not overlap
+LABELS = {COMPUTE: "training compute [TFLOP]", LATENCY: "live latency of a step [ms]"}
+
+
+def draw_frontiers(table: Table) -> bytes:
+    """Return a picture (SVG) of error against training compute and against latency, side by side."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
+
+    points = {cost: list(list_points(table, cost)) for cost in LABELS}
+    names = sorted({point.series for found in points.values() for point in found})
+    with rc_context({"svg.hashsalt": table.name, "font.size": 9}):
+        figure = Figure(figsize=(9, 3.6), layout="constrained")
+        first = None
+        for number, (cost, found) in enumerate(points.items(), 1):
+            first = axes = figure.add_subplot(1, 2, number, sharey=first)
+            _draw_curves(axes, found, names, SHIFT if cost == COMPUTE else 1.0)
+            axes.set_xscale("log", subs=[])
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.set(xlabel=LABELS[cost], ylabel=add_unit(choose_metric(table)))
+            axes.grid(alpha=0.25)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+        picture = BytesIO()
+        figure.savefig(picture, format="svg", metadata={"Date": None})
+    return picture.getvalue()
+
+
+def _draw_curves(axes: Axes, points: Sequence[Point], names: Sequence[str], ratio: float) -> None:
+    """Draw a curve for each network; `ratio` is the distance between neighbouring networks at one cost."""
+    for name, group in itertools.groupby(points, key=lambda point: point.series):
+        own = list(group)
+        sides = [[one.mean - one.low for one in own], [one.high - one.mean for one in own]]
+        colour, shift = f"C{names.index(name) % 10}", ratio ** (names.index(name) - len(names) / 2)
+        axes.errorbar(
+            [shift * one.cost for one in own], [one.mean for one in own], sides, label=name, color=colour,
+            marker="o", markersize=4, capsize=2, linewidth=1.4,
+        )  # fmt: skip
+
+
+def make_tables(folder: Path) -> dict[str, KeptTable]:
+    """Return the tables of all kept results in a folder, by file stem."""
+    if not (folder / "data").is_dir():
+        raise InputError(f"{folder}/data: no such folder; memmlp results save --out {folder}/data makes it")
+    tables = {}
+    for path in sorted((folder / "data").glob("*.json")):
+        kept = load_kept_results(path)
+        sources = () if kept.rounds else kept.sources  # verdicts by seed rounds need all clips
+        by_source = tuple(make_kept_table(kept, source) for source in sources)
+        regroup = partial(make_kept_table, kept, None)
+        tables[path.stem] = KeptTable(kept, make_kept_table(kept), by_source, regroup)
+    return tables
+
+
+def update(folder: Path, check: bool) -> int:
+    """Write the pages that differ, and remove old ones; with `check` only list them. Return the exit code."""
+    templates = {path.name: path.read_text(encoding="utf-8") for path in (folder / "templates").glob("*.md")}
+    tables = make_tables(folder)
+    made = make_pages(tables, templates)
+    paths = [*folder.glob("*.md"), *(folder / FILES).glob("*")]
+    present = {str(path.relative_to(folder)): path.read_bytes().decode("utf-8", "replace") for path in paths}
+    differing = [name for name, text in made.items() if present.get(name) != text]
+    old = present.keys() - made.keys()
+    stale = sorted(name for name in old if present[name].startswith(MARK) or name.startswith(f"{FILES}/"))
+    print(f"{folder}: {len(made)} files, {len(differing)} {'differ' if check else 'written'}")
+    if check:
+        for name in [*differing, *stale]:
+            print(f"{folder / name}: differs from the kept results; make it again", file=sys.stderr)
+        return int(bool(differing or stale))
+    (folder / FILES).mkdir(exist_ok=True)
+    for name in differing:
+        atomic_write(folder / name, made[name])
+    for name, picture in draw_pictures(tables).items():  # its bytes differ between matplotlib's versions
+        if name.replace("_frontier.svg", ".md") in differing or not (folder / name).exists():
+            atomic_write(folder / name, picture)
+    for name in stale:
+        (folder / name).unlink()
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if a page differs")
+    parser.add_argument("--folder", type=Path, default=HERE, help="folder of the pages, data and templates")
+    return parser
+
+
+if __name__ == "__main__":
+    arguments = parser().parse_args()
+    sys.exit(update(arguments.folder, arguments.check))
