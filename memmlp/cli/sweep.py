@@ -63,7 +63,7 @@ def sweep(
     NAME is the path of a sweep file, a shipped sweep, or the number of a table. OVERRIDES are those of
     `memmlp train`, for all variants; `seed=0,1` sets the seeds. By default, workers are processes that share
     this machine's GPUs. They can also be Slurm jobs (`executor=slurm slurm.partition=P slurm.time=10:00:00
-    slurm.gpus=1`, or other options of sbatch), or Ray tasks (`executor=ray ray.num_gpus=1`).
+    slurm.gpus=1`, or other options of sbatch).
 
     With --until-decided, all variants get three seeds first. Then variants with inconclusive verdicts, and
     their controls, get more seeds, up to --max-seeds.

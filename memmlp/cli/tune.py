@@ -46,7 +46,7 @@ def tune(
     from memmlp.sweep.search.study import Study
 
     if workers.executor == "debug":  # the search would wait for trials in its own process
-        raise InputError("executor=debug: expected local, slurm or ray for a search")
+        raise InputError("executor=debug: expected local or slurm for a search")
     setup = prepare_search(overrides, config_dir, outputs.absolute())
     if status:
         show(setup)

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from memmlp.sweep.executors.local import GpuGroup
     from memmlp.sweep.plan import Plan
 
-EXECUTORS = ("local", "slurm", "ray", "debug")  # debug runs everything in this process, for debuggers
+EXECUTORS = ("local", "slurm", "debug")  # debug runs everything in this process, for debuggers
 DEVICES_WITHOUT_GPU = {"cpu", "mps"}  # devices that do not need a CUDA GPU
-EXECUTORS_WITH_SETTINGS = ("slurm", "ray")  # executors with settings NAME.KEY=VALUE
-CUSTOM_PREFIX = "executor"  # prefix of the settings of a custom executor, executor.KEY=VALUE
+SETTINGS = ("slurm", "executor")
+"""Prefixes of settings: slurm.KEY=VALUE, and executor.KEY=VALUE for a custom executor."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +49,11 @@ class Workers:
 
     def parse_options(self) -> Any:
         """Parse and check the executor's settings. Raises InputError for a wrong setting."""
-        if self.executor == "slurm":
-            from memmlp.sweep.executors.slurm import parse_slurm_options
-
-            return parse_slurm_options(self.settings)
-        if self.executor != "ray":
+        if self.executor != "slurm":
             return None
-        from memmlp.sweep.executors import parse_settings, ray_cluster
+        from memmlp.sweep.executors.slurm import parse_slurm_options
 
-        return parse_settings("ray", self.settings, ray_cluster.SETTINGS)
+        return parse_slurm_options(self.settings)
 
     def make_batch_script(self, folder: Path) -> str:
         """Return the batch file for sbatch; an empty text for executors other than Slurm."""
@@ -94,18 +90,12 @@ class Workers:
                 raise InputError(line)
         return divide_gpus(gpus, self.gpus_per_worker)
 
-    def start_executor(self, folder: Path, shares: Sequence[GpuGroup], gpus: bool) -> Executor:
-        """Make the executor. Its workers write logs in `folder`/workers, and share this machine's GPUs.
-        `gpus`: whether runs can use a GPU."""
-        options = self.parse_options()
+    def start_executor(self, folder: Path, shares: Sequence[GpuGroup]) -> Executor:
+        """Make the executor. Its workers write logs in `folder`/workers, and share this machine's GPUs."""
         if self.executor == "slurm":
             from memmlp.sweep.executors.slurm import Slurm
 
-            return Slurm(get_log_path(folder), options)
-        if self.executor == "ray":
-            from memmlp.sweep.executors.ray_cluster import Ray
-
-            return Ray(options, gpus)
+            return Slurm(get_log_path(folder), self.parse_options())
         if "." in self.executor:
             from memmlp.config.plugins import import_object
 
@@ -167,15 +157,15 @@ def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple
     for override in map(Override.parse, overrides):
         if override.key == "executor":
             executor = override.value or ""
-        elif override.group in (*EXECUTORS_WITH_SETTINGS, CUSTOM_PREFIX):
+        elif override.group in SETTINGS:
             executor_settings.append(override)
         else:
             remaining.append(override.text)
     if executor not in EXECUTORS and "." not in executor:
-        raise InputError(f"executor={executor}: expected local, slurm, ray or the path of a class")
+        raise InputError(f"executor={executor}: expected local, slurm or the path of a class")
     for override in executor_settings:
-        if override.group != (CUSTOM_PREFIX if "." in executor else executor):
-            name = "PATH, a custom executor" if override.group == CUSTOM_PREFIX else override.group
+        if override.group != ("executor" if "." in executor else executor):
+            name = "PATH, a custom executor" if override.group == "executor" else override.group
             raise InputError(f"{override.key}: needs executor={name}")
     settings = {one.key.partition(".")[2]: one.value or "" for one in executor_settings}
     return executor, settings, tuple(remaining)
@@ -194,7 +184,7 @@ def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[st
     shares = workers.make_gpu_shares(named)
     count = workers.count_workers(shares)
     may_use_gpu = not named <= DEVICES_WITHOUT_GPU
-    executor = workers.start_executor(folder, shares, may_use_gpu)
+    executor = workers.start_executor(folder, shares)
     stem = folder / "controllers" / uuid4().hex
     path = stem.with_suffix(".json")
     plan.save(path)

@@ -25,7 +25,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
     ("0,1", {"workers_per_gpu": 3}, ["cuda"], [("0",), ("1",)], 6),
     ("0,1,2", {"gpus_per_worker": 2}, ["cuda"], [("0", "1")], 1),
     ("0,1", {"gpus_per_worker": 0, "count": 3}, ["auto"], [], 3), ("0,1", {"count": 3}, ["cpu"], [], 3),
-    ("", {"count": 3}, ["auto"], [], 3), ("0,1", {"executor": "ray", "count": 3}, ["cuda"], [], 3),
+    ("", {"count": 3}, ["auto"], [], 3), ("0,1", {"executor": "my.Cloud", "count": 3}, ["cuda"], [], 3),
 ])  # fmt: skip
 def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, number):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
@@ -35,7 +35,7 @@ def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, n
 
 @pytest.mark.parametrize(("wanted", "visible", "executor", "line"), [
     ("cuda:1", "0,1", "local", "device=cuda:1"),
-    ("cuda:1", "", "ray", "device=cuda:1"),
+    ("cuda:1", "", "my.Cloud", "device=cuda:1"),
     ("cuda", "", "local", "device=cuda: no GPU is visible here"),
     ("auto", "0", "local", "torch .* does not find one"),
 ])  # fmt: skip
@@ -49,25 +49,23 @@ def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, vis
 @pytest.mark.parametrize("option", ["gpus_per_worker", "workers_per_gpu"])
 def test_options_of_local_workers_are_refused_elsewhere(option: str):
     with pytest.raises(InputError, match=f"--{option.replace('_', '-')}: needs workers of this machine"):
-        Workers("ray", **{option: 1})
+        Workers("my.Cloud", **{option: 1})
 
 
 def test_settings_belong_to_one_executor():
-    name = "ray"
-    words = (f"executor={name}", f"{name}.address=head:1", f"{name}.resources.big=2", "seed=1")
+    words = ("executor=slurm", "slurm.partition=long", "seed=1")
     executor, own, rest = split_executor(words)
-    assert (executor, rest) == (name, ("seed=1",))
-    assert Workers(executor, own).parse_options() == {"address": "head:1", "resources": {"big": 2.0}}
-    with pytest.raises(InputError, match=f"{name}.address: needs executor={name}"):
+    assert (executor, own, rest) == ("slurm", {"partition": "long"}, ("seed=1",))
+    with pytest.raises(InputError, match=r"slurm.partition: needs executor=slurm"):
         split_executor(words[1:])
     with pytest.raises(InputError, match="executor"):
         split_executor(("executor=",))
 
 
 @pytest.mark.parametrize(("executor", "gives", "wanted", "gpu"), [
-    ("local", True, ["auto"], True), ("local", False, ["auto"], False), ("ray", True, ["cuda"], True),
-    ("ray", True, ["cpu"], False), ("ray", True, ["cpu", "auto"], True),
-    ("ray", False, ["auto"], False),
+    ("local", True, ["auto"], True), ("local", False, ["auto"], False), ("my.Cloud", True, ["cuda"], True),
+    ("my.Cloud", True, ["cpu"], False), ("my.Cloud", True, ["cpu", "auto"], True),
+    ("my.Cloud", False, ["auto"], False),
 ])  # fmt: skip
 def test_workers_know_whether_they_are_to_have_a_gpu(
     found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor, gives, wanted, gpu
