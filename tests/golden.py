@@ -344,7 +344,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "ik.arms": partial(ik, Arms()),
     "graph.streaming": partial(deployed, "graph.streaming"),
     "graph.naive": partial(deployed, "graph.naive"),
-    **{precision: partial(lowered, precision) for precision in ("int8", "int8_blocks", "fp16")},
+    **{precision: partial(lowered, precision) for precision in ("int8", "fp16")},
 }  # fmt: skip
 UNSEEN = ("export", "latency")
 """Components without numbers: a file format, and times."""
@@ -361,7 +361,7 @@ def changed(now: Mapping[str, float], before: Mapping[str, float], tolerance: fl
 
 def tolerance(case: str) -> float:
     """The relative difference between processors: larger in low precision, which rounds up or down."""
-    return 2e-2 if case in ("int8", "int8_blocks", "fp16", "optim.muon") else 2e-4
+    return 2e-2 if case in ("int8", "fp16", "optim.muon") else 2e-4
 
 
 def numbers(case: str) -> Numbers:

@@ -21,7 +21,7 @@ DEFAULT_MODELS = (
     f"{BASE},agrol_mlp,agrol_mlp@41,agrol_diffusion,mem_mlp,mem_mlp@60,ego_poser,hmd_poser,vae_hmd,rpm,"
     "manikin_s,recurrent_poser"
 )
-LOWER_PRECISIONS = ("fp16", "int8", "int8_blocks")
+LOWER_PRECISIONS = ("fp16", "int8")
 DEPLOYED = ("naive", "streaming", *LOWER_PRECISIONS)
 GRAPHS = ("network", *DEPLOYED)
 

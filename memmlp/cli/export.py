@@ -43,7 +43,7 @@ class ExportForm(NamedTuple):
 @click.option(
     "--precision",
     default="fp32",
-    type=click.Choice(["fp32", "fp16", "int8", "int8_blocks"]),
+    type=click.Choice(["fp32", "fp16", "int8"]),
     help="Precision of the inner layers' weights. The accuracy of lower precisions is measured on test "
     "clips. int8 is calibrated on training clips.",
 )
@@ -105,8 +105,8 @@ def export(
     if scope == "step" and option:
         raise InputError(f"{option}: needs --scope full; the network's inputs are in AMASS' world")
     if precision == "fp32" and max_growth is not None:
-        raise InputError(f"--max-growth {max_growth:g}: needs --precision fp16, int8 or int8_blocks")
-    if precision.startswith("int8") and scope == "full":
+        raise InputError(f"--max-growth {max_growth:g}: needs --precision fp16 or int8")
+    if precision == "int8" and scope == "full":
         raise InputError(f"--precision {precision}: needs --scope step")
     full = (space or "amass", rotations or "matrix") if scope == "full" else None
     form, limit = ExportForm(graph, precision, opset, full), 0.01 if max_growth is None else max_growth / 100

@@ -24,7 +24,6 @@ from memmlp.report.tables.measured_run import (
 )
 from memmlp.report.tables.table_text import describe_missing_clips
 from memmlp.runs.deployment_folder import (
-    INT8_PRECISIONS,
     MAX_GROWTH,
     MAX_JITTER_GROWTH,
     find_deployed_precision,
@@ -116,7 +115,7 @@ def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
         + (f", fp32 {record['median_ms']:.2f} ms)" if lower else ")")
     )
     cost = record.get(precision) or {}
-    if precision in INT8_PRECISIONS and "jitter_growth" in cost and not is_accurate_enough(cost):
+    if precision == "int8" and "jitter_growth" in cost and not is_accurate_enough(cost):
         yield format_warning(
             f"{precision}: MPJPE {cost['growth']:+.1%}, Jitter {cost['jitter_growth']:+.1%}, more than "
             f"{MAX_GROWTH:.0%} and {MAX_JITTER_GROWTH:.0%}: memmlp live uses float32"

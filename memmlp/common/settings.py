@@ -15,7 +15,7 @@ MISSING = "???"
 SIZES = ("tiny", "small", "paper")
 """The values of `profile.sizes`: sizes for tests, sizes for a CPU, and the paper's sizes."""
 
-PRECISIONS = ("fp32", "int8", "int8_blocks", "fp16")
+PRECISIONS = ("fp32", "int8", "fp16")
 """The values of `export.precision`."""
 
 

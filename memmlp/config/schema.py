@@ -257,8 +257,8 @@ class ExportConfig:
     # streaming: computes each frame's features once; naive: the network as trained; auto: streaming if
     # available, otherwise naive; off: no export
     graph: str = setting(one_of("auto", "streaming", "naive", "off"), "auto")
-    # int8, int8_blocks (for networks without a window) and fp16 write an additional file beside the float32
-    # file. memmlp live uses integers if MPJPE grows by at most 1 % and Jitter by at most 10 %
+    # int8 and fp16 write an additional file beside the float32 file. memmlp live uses int8 if MPJPE grows by
+    # at most 1 % and Jitter by at most 10 %
     precision: str = setting(one_of(*PRECISIONS), "fp32")
     alone: bool = setting(default=False)  # true: also time only the network, as papers do (Table 17)
     # the operator set of the ONNX files; older inference engines need 15

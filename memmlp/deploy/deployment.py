@@ -42,7 +42,7 @@ class Deployment:
     Attributes:
         latency_steps: number of steps to time, after a warm-up.
         graph: "auto", "streaming" or "naive" (see GRAPHS).
-        precision: "fp32", "int8", "int8_blocks" or "fp16". A float32 file is always written; other precisions
+        precision: "fp32", "int8" or "fp16". A float32 file is always written; other precisions
             add a second file.
         opset: ONNX opset of the files, one of memmlp.deploy.opsets.OPSETS.
         alone: whether to time the network also without conversions and forward kinematics.

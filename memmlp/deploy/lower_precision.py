@@ -1,4 +1,4 @@
-"""Lower precision of an exported stream (int8, int8 in blocks, fp16), and its loss of accuracy.
+"""Lower precision of an exported stream (int8, fp16), and its loss of accuracy.
 
 Only the inner layers of a network change. The first and last modules stay in float32
 (`StreamingGraph.float32_modules`). The input of the stem has outliers, and rounding in the heads would cause
@@ -37,10 +37,6 @@ from memmlp.runs.deployment_folder import is_accurate_enough
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
 TEST_FRAMES = 20_000  # maximum number of frames for measuring accuracy
 LARGEST = float(np.finfo(np.float16).max)
-BLOCK = 32  # number of inputs that share a scale; the minimum that all ONNX Runtime kernels support
-LEVELS, ZERO = 127, 128  # the byte of a weight w is 128 + 127 w / (largest weight in its block)
-DOMAIN = "com.microsoft"
-INTEGER_ACCURACY = 4  # the accuracy level at which MatMulNBits multiplies integers
 
 
 def write_lower_precision(
@@ -49,7 +45,7 @@ def write_lower_precision(
     """Write an ONNX file with lower precision.
 
     Args:
-        precision: "int8", "int8_blocks" or "fp16".
+        precision: "int8" or "fp16".
         source: the float32 ONNX file of a streaming graph.
         path: the file to write.
         network: the graph; its `float32_modules` stay in float32.
@@ -63,8 +59,7 @@ def write_lower_precision(
     if precision == "int8":
         _quantise_to_int8(source, path, inner, train)
     else:
-        change = convert_to_int8_blocks if precision == "int8_blocks" else convert_to_fp16
-        atomic_write(path, change(model, inner).SerializeToString())
+        atomic_write(path, convert_to_fp16(model, inner).SerializeToString())
 
 
 def find_inner_layers(model: ModelProto, kept: Sequence[str]) -> list[str]:
@@ -155,56 +150,6 @@ def _check_quantised(model: ModelProto, inner: Collection[str]) -> None:
         raise RuntimeError(
             f"ONNX Runtime left {len(skipped)} of {len(inner)} layers in float32, such as {skipped[0]}"
         )
-
-
-def convert_to_int8_blocks(model: ModelProto, inner: Sequence[str]) -> ModelProto:
-    """Return the graph with 8-bit weights. Each output of a layer has a scale for every 32 inputs.
-
-    ONNX Runtime's operator `MatMulNBits` also rounds the inputs to eight bits at run time, with a scale for
-    every 32 inputs. So calibration is not needed, and a layer is one operation instead of four. This is fast
-    for networks without a window, because their products have one row. Products with a row per frame of a
-    window are slower than in float32.
-    """
-    constants, nodes = GraphConstants(model.graph), list[NodeProto]()
-    for node in model.graph.node:
-        if node.name not in inner:
-            nodes.append(node)
-            continue
-        values, name, *bias = node.input
-        weight = constants.get_value(name)
-        if not any(one.name == "transB" and one.i for one in node.attribute):
-            weight = weight.T
-        codes, scales = quantise_in_blocks(weight)
-        stored = constants.add(f"{name}.blocks", codes), constants.add(f"{name}.scales", scales.reshape(-1))
-        product = helper.make_node(
-            "MatMulNBits",
-            [values, *stored, *(["", "", *bias] if bias else [])],
-            list(node.output),
-            node.name,
-            domain=DOMAIN,
-            N=weight.shape[0],
-            K=weight.shape[1],
-            bits=8,
-            block_size=BLOCK,
-            accuracy_level=INTEGER_ACCURACY,
-        )
-        nodes.append(product)
-    constants.replace_nodes(nodes)
-    if all(one.domain != DOMAIN for one in model.opset_import):
-        model.opset_import.append(helper.make_opsetid(DOMAIN, 1))
-    return model
-
-
-def quantise_in_blocks(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quantise a weight (outputs, inputs) to bytes (outputs, blocks, 32) and scales (outputs, blocks).
-
-    The last block is padded with zeros.
-    """
-    outputs, inputs = weight.shape
-    padded = np.pad(weight, ((0, 0), (0, -inputs % BLOCK))).reshape(outputs, -1, BLOCK)
-    scales = np.abs(padded).max(-1) / LEVELS
-    steps = np.divide(padded, scales[..., None], where=scales[..., None] > 0, out=np.zeros_like(padded))
-    return (np.rint(steps) + ZERO).astype(np.uint8), scales.astype(np.float32)
 
 
 def convert_to_fp16(model: ModelProto, inner: Sequence[str]) -> ModelProto:

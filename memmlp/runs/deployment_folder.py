@@ -15,9 +15,6 @@ from memmlp.runs.identity import belongs_to_folder, find_deployment_versions, ha
 ONNX_FILES = {name: "step.onnx" if name == "fp32" else f"step.{name}.onnx" for name in PRECISIONS}
 """The ONNX file names, by precision (`export.precision`)."""
 
-INT8_PRECISIONS = ("int8", "int8_blocks")
-"""The precisions for live use, if accurate enough: at the paper's sizes, they are faster than float32."""
-
 MAX_GROWTH, MAX_JITTER_GROWTH = 0.01, 0.10
 """A lower precision may replace float32 if MPJPE and Jitter grow at most by these fractions."""
 
@@ -84,9 +81,7 @@ class DeploymentFolder:
     @property
     def accurate_int8_file(self) -> Path | None:
         """An existing int8 ONNX file that is accurate enough to replace float32; None without one."""
-        record = self.record
-        accurate = [name for name in INT8_PRECISIONS if is_accurate_enough(record.get(name, {}))]
-        return next((self.onnx_path(name) for name in accurate if self.onnx_path(name).exists()), None)
+        return self.int8 if is_accurate_enough(self.record.get("int8", {})) and self.int8.exists() else None
 
 
 def is_accurate_enough(cost: Mapping[str, Any]) -> bool:

@@ -50,7 +50,6 @@ VERSIONS: dict[str, int] = {
     "graph.streaming": 1,
     "graph.naive": 1,
     "int8": 3,
-    "int8_blocks": 3,
     "fp16": 3,
     "latency": 1,
 }

@@ -128,7 +128,7 @@ COSTS = (
 Costs = _record(**dict.fromkeys(COSTS, Number))
 Deployment = _record(
     Costs, run=str, settings=Settings, made=str, made_by=Origin, artifacts=dict[Name, str],
-    graph=str, int8=Costs, int8_blocks=Costs, fp16=Costs,
+    graph=str, int8=Costs, fp16=Costs,
 )  # fmt: skip
 LogEntry = _complete_record(step=int, phase=str, values=dict[str, Number], time=float)
 Tree = dict[str, Any]  # results.json

@@ -1,7 +1,6 @@
 """Lower precisions: which layers have them, what they compute, and what they cost."""
 
 import shutil
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,11 +11,10 @@ import onnx
 import pytest
 import tiny
 from onnx import TensorProto, numpy_helper
-from onnxruntime import InferenceSession
 
 from memmlp.common.errors import InputError
 from memmlp.deploy import lower_precision
-from memmlp.deploy.lower_precision import find_inner_layers, quantise_in_blocks, write_lower_precision
+from memmlp.deploy.lower_precision import find_inner_layers, write_lower_precision
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import GraphConstants
 from memmlp.deploy.parity import stream_onnx
@@ -81,23 +79,6 @@ def one_product(weight: np.ndarray, bias: np.ndarray) -> onnx.ModelProto:
     return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=10)
 
 
-def test_a_product_in_blocks_is_that_of_the_rounded_weight():
-    """Computed independently, with inputs rounded as the operator rounds them: in blocks, to eight bits."""
-    rng = np.random.default_rng(0)
-    weight, bias = rng.standard_normal((24, 70)).astype(np.float32), np.ones(24, np.float32)
-    values = rng.standard_normal((1, 70)).astype(np.float32)
-    graph = lower_precision.convert_to_int8_blocks(one_product(weight, bias), ["product"])
-    made = InferenceSession(graph.SerializeToString()).run(None, {"x": values})[0]
-
-    def rounded(matrix: np.ndarray) -> np.ndarray:
-        codes, scales = quantise_in_blocks(matrix)
-        whole = (codes.astype(float) - lower_precision.ZERO) * scales[..., None]
-        return whole.reshape(len(codes), -1)[:, :70]
-
-    np.testing.assert_allclose(made, rounded(values) @ rounded(weight).T + bias, atol=2e-3)
-    assert np.abs(made - (values @ weight.T + bias)).max() > 2e-3
-
-
 def test_layers_that_onnx_runtime_skips_are_an_error(
     step_files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -118,24 +99,6 @@ def test_a_network_without_inner_layers_is_refused(tmp_path: Path, precision: st
     with pytest.raises(InputError, match=r"export\.precision"):
         write_lower_precision(precision, path, tmp_path / "lower.onnx", stream, [CLIP])
     assert {file.name for file in tmp_path.iterdir()} == {"step.onnx"}
-
-
-def test_only_cells_are_in_blocks_and_the_motion_is_near(step_files, tmp_path: Path):
-    exact, path = step_files("recurrent_poser"), tmp_path / "blocks.onnx"
-    stream = make_streaming_graph(exported.NETWORKS["recurrent_poser"]())
-    write_lower_precision("int8_blocks", exact, path, stream, [])
-    before, after = (Counter(node.op_type for node in onnx.load(file).graph.node) for file in (exact, path))
-    graph = onnx.load(path).graph
-    layers = {n.input[1].removesuffix(".blocks") for n in graph.node if n.op_type == "MatMulNBits"}
-    stored = {tensor.name for tensor in graph.initializer}
-    assert layers
-    assert all(".cell." in name for name in layers)
-    assert not layers & stored  # the float32 weights are gone
-    member = "model.model.members.member1"
-    assert {f"{member}.stem.weight", f"{member}.head.weight"} <= stored
-    assert sum(before.values()) == sum(after.values())
-    apart = stream_onnx(OnnxStream(exact), CLIP) - stream_onnx(OnnxStream(path), CLIP)
-    assert 1e-6 < float(apart.abs().mean()) < 0.005
 
 
 @pytest.fixture(scope="module")
