@@ -69,26 +69,6 @@ def test_kept_results_have_the_same_bytes(kept: KeptResults, tmp_path: Path):
     assert max(map(len, format_results(kept).splitlines())) < 1000  # changes can be read
 
 
-def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: KeptResults, tmp_path: Path):
-    """Variants may show what two graphs of one training cost, and one of them two evaluations, too."""
-    one, two, three = list(kept.runs)[:3]
-    runs = {
-        label: {s: replace(run, clip_sources={}) for s, run in kept.runs[label].items()}
-        for label in (one, three)
-    }
-    slower = {seed: replace(run, costs={**run.costs, "ms": 5.0}) for seed, run in runs[one].items()}
-    solved = {seed: replace(run, id=runs[one][seed].id) for seed, run in runs[three].items()}
-    save_results(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: slower, three: solved}))
-    read = load_kept_results(tmp_path / "kept.json")
-    for seed, run in read.runs[one].items():
-        assert run.costs["ms"] == pytest.approx(kept.runs[one][seed].costs["ms"])
-        assert (run.id, read.runs[two][seed].costs["ms"]) == (read.runs[two][seed].id, 5.0)
-        assert read.runs[three][seed].means != run.means
-    assert format_results(read) == (tmp_path / "kept.json").read_text()
-    flags = make_table(replace(sweep, control=one), read.select_runs(sweep)).flags
-    assert f"'{two}' and '{one}' are one run: they differ only in deployment and costs" in flags
-
-
 def test_results_with_further_runs_are_not_replaced(kept: KeptResults):
     fewer = replace(kept, runs={label: {0: runs[0]} for label, runs in kept.runs.items()})
     kept.check_can_replace(fewer)

@@ -47,16 +47,6 @@ def test_errors_colour_the_limbs_of_their_joints(camera: Camera):
     assert at(picture, camera, TRUTH[0, 4]).argmax() == 2
 
 
-def test_the_nearer_body_part_is_seen(camera: Camera):
-    """A hand before the chest is seen there in its own colour, a hand behind it is not."""
-    for away, channel in ((0.35, 0), (-0.35, 2)):
-        joints = TRUTH[0].copy()
-        joints[20] = joints[9] + away * camera.axes[2]
-        errors = np.zeros(22)
-        errors[20] = 1.0
-        assert at(draw(camera, joints, errors), camera, joints[20]).argmax() == channel
-
-
 def test_a_diverged_network_leaves_a_white_panel(camera: Camera):
     picture = draw(camera, np.full((22, 3), np.nan), np.full(22, np.nan))
     assert (picture > 100).all()

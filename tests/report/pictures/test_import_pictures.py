@@ -17,13 +17,10 @@ from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.importing.convert import view_stance
 from memmlp.motion.importing.skeleton_map import find_skeleton
 from memmlp.motion.synthetic import synthesize_clip
-from memmlp.report.pictures.drawing import get_pixels
 from memmlp.report.pictures.import_pictures import (
-    ACROSS,
     LEFT,
     MIDDLE,
     RIGHT,
-    draw_sheet,
     read_sample,
     write_skeleton_picture,
 )
@@ -55,15 +52,6 @@ def test_bad_files_are_named(folder: Path, tmp_path: Path):
         read_sample(folder, 1)
     with pytest.raises(InputError, match="No such file"):
         read_sample(tmp_path / "none.npz", 1)
-
-
-@pytest.mark.slow
-def test_a_sheet_has_a_row_for_every_few_clips(folder: Path):
-    sheet = get_pixels(draw_sheet(read_sample(folder, 5)[0]))
-    height, width = sheet.shape[:2]
-    panels = sheet[height // 2 + 30 :].reshape(-1, 3 * ACROSS, width // (3 * ACROSS), 3)
-    blank = [(panels[:, number] == 255).all() for number in range(3 * ACROSS)]
-    assert blank == [False] * 3 + [True] * 9  # the fifth clip has three panels in the second row
 
 
 @pytest.mark.slow

@@ -70,16 +70,3 @@ def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(t
         group_clips(own, ["^(kicks)/", "nothing"])
     with pytest.raises(InputError, match=r"^--together \(: .*regular expression"):
         group_clips(own, ["("])
-
-
-def test_a_mode_in_which_nothing_was_measured_is_left_out(tmp_path: Path):
-    sweep = parse_sweep("two", {"variants": {"one": [], "both": ["optim.lr=1"]}, "seeds": [0]})
-    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
-    assert make_table(sweep, runs).modes == ("stream", "window")
-    streamed = {
-        label: {seed: replace(run, means={"stream": run.means["stream"]}) for seed, run in found.items()}
-        for label, found in runs.items()
-    }
-    assert make_table(sweep, streamed).modes == ("stream",)
-    assert make_table(sweep, {**streamed, "both": runs["both"]}).modes == ("stream", "window")
-    assert make_table(sweep, streamed, ["window"]).modes == ("window",)

@@ -15,9 +15,7 @@ from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.effects import compute_effects, compute_mean_cost
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.statistics import Verdict, correct_by_holm, estimate_paired_effects
-from memmlp.report.tables.table import Table
 from memmlp.report.tables.table_text import make_legend
-from memmlp.runs.evaluation_file import write_report
 from memmlp.sweep.definition import COSTS, Sweep
 
 
@@ -35,14 +33,6 @@ def test_difference_is_paired_by_seed_and_clip(sweep: Sweep, tmp_path: Path):
     assert effect.high - effect.low < 0.5
     run = load_measured_run(next((tmp_path / "runs").iterdir()))
     assert np.ptp(run.get_clip_values(CLIPS, "stream", "rotation", "MPJPE")) > 1.5
-
-
-def test_correction_is_over_all_modes_and_metrics(table: Table):
-    cells = [c for row in table.rows for cells in row.cells.values() for c in cells.values()]
-    tested = [c.effect for c in cells if c.effect and c.effect.p is not None]
-    assert table.comparisons == len(tested) == 2 * 3 + 2 * 2  # the variant "by position" has no MPJRE
-    smallest = min(tested, key=lambda effect: effect.p)
-    assert smallest.holm == pytest.approx(min(1, smallest.p * len(tested)))
 
 
 def test_a_mean_has_the_interval_of_its_errors(sweep: Sweep, tmp_path: Path):
@@ -100,20 +90,6 @@ def test_confounded_rows_are_counted_apart(sweep: Sweep, tmp_path: Path):
     assert "no | memory ‡" in printed(after, 100)
 
 
-def test_what_would_have_been_found_is_so_after_the_table_s_own_correction(sweep: Sweep, tmp_path: Path):
-    """A variant of one seed has no p-values, and so no share in the correction."""
-    find, seen = fake_sweep(tmp_path, sweep, EFFECTS), []
-    for seeds, comparisons in (((0,), 6), ((), 6), (sweep.seeds, 10)):
-
-        def some(variant, seed, seeds=seeds):
-            return find(variant, seed) if variant.label != "by position" or seed in seeds else None
-
-        table = table_of(sweep, some)
-        assert table.comparisons == comparisons
-        seen.append(cell(table, "no | memory", "MPJPE").effect.detectable)
-    assert seen[0] == seen[1] < seen[2]
-
-
 def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
     """Interval, correction, equivalence and verdict equal those that are put together here by hand."""
     find = fake_sweep(tmp_path, sweep, {"no | memory": 1.004, "by position": 1.05})
@@ -153,30 +129,6 @@ def test_a_row_has_its_own_control(sweep: Sweep, tmp_path: Path):
     assert "of 'no | memory' from 'by position'" in " ".join(printed(table, 200).split())
 
 
-def test_one_head_is_told_where_it_diverged_on_a_clip(sweep: Sweep, tmp_path: Path):
-    """A seed without a mean empties no variant's row; two heads that diverged are not one."""
-    find = fake_sweep(tmp_path, sweep, {"no | memory": 1.2})
-    for label, seed in (("no | memory", 0), ("no | memory", 1), ("full_model", 1)):
-        run = find(next(variant for variant in sweep.variants if variant.label == label), seed)
-        assert run is not None
-        for mode in ("stream", "window"):
-            report = json.loads(run.evaluation(f"{mode}-0").read_text())
-            for errors in (report["mean"], *report["clips"]) if label == "no | memory" else ():
-                errors["position"] = {"MPJPE": errors["rotation"]["MPJPE"]}
-                del errors["combined"]
-            for errors in (report["mean"], report["clips"][0]) if seed == 1 else ():
-                for branch in ("rotation", "position"):
-                    errors[branch] = dict.fromkeys(errors[branch], "nan")
-            write_report(run.evaluation(f"{mode}-0"), {key: report[key] for key in ("mode", "mean", "clips")})
-    runs = runs_of(replace(sweep, seeds=(0, 1)), find)
-    table = make_table(replace(sweep, seeds=(0, 1)).with_branch("combined"), runs)
-    rows = {row.label: row.branch for row in table.rows}
-    assert (rows["no | memory"], rows["full_model"]) == ("rotation", "combined")
-    assert not runs["full_model"][1].has_one_branch
-    assert np.isnan(cell(table, "no | memory", "MPJPE").mean)
-    assert cell(table, "no | memory", "MPJPE").effect.clips == 11
-
-
 def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
     source = replace(sweep, branch_source="the text says so").with_branch("combined")
     find = fake_sweep(tmp_path, sweep)
@@ -194,17 +146,6 @@ def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
     assert verdicts <= {"higher", "lower", "inconclusive"}
     run = runs_of(source, find)["full_model"][0]
     assert cell(table, "full_model", "MPJPE").values[0] == run.get_value("stream", "combined", "MPJPE")
-
-
-def test_a_branch_that_was_not_evaluated_is_no_other(sweep: Sweep, tmp_path: Path):
-    """A network with two heads and no inverse kinematics yet is not shown by its rotation branch instead."""
-    find = fake_sweep(tmp_path, sweep, branches=["rotation", "position"])
-    table = table_of(sweep.with_branch("combined"), find, command="memmlp sweep 11")
-    assert cell(table, "full_model", "MPJPE").mean is None
-    words = (
-        "not evaluated in the branch combined: 'no | memory', 'full_model'; evaluate with: memmlp sweep 11"
-    )
-    assert words in table.flags
 
 
 def test_variants_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path):

@@ -10,7 +10,6 @@ import pytest
 from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, nothing, runs_of, table_of, write_evaluation
 from fake_table import cell, printed
 
-from memmlp.report.kept_results import KeptResults, format_results, load_kept_results
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table_text import FORMATS
@@ -218,12 +217,7 @@ ORIGINS = [
     ({"git": {"commit": "fedcba9876543210", "dirty": False}}, ("code differs", "fedcba9", "0123456")),
     ({"git": ORIGIN["git"] | {"dirty": True}}, ("uncommitted changes", "'by position'")),
     ({"data": "e" * 64}, ("data differs", "dddddddd of 'no | memory', 'full_model'", "eeeeeeee of 'by")),
-    ({"cpu": "Another one"}, ("hardware differs", "Another one of")),
-    ({"git": None}, ("code differs", "version 0.3.0 of")), ({"threads": 2}, ("threads differs", "2 of")),
     ({"device": "cuda"}, ("device differs", "cuda of 'by position'", "cpu of 'no | memory'")),
-    ({"gpu": "A card"}, ("GPU differs", "A card of", "none of ")),
-    ({"processes": 2}, ("processes differs", "2 of 'by position'", "1 of 'no | memory'")),
-    ({"packages": {"torch": "3.0"}}, ("torch differs", "3.0 of")),
     ({"precision": "bf16"}, ("precision differs", "bf16 of")),
     ({"component_versions": {"memory": 2}}, ("memory differs", "2 of")),
 ]  # fmt: skip
@@ -249,8 +243,6 @@ CHANGED_PREREQUISITES = [
     ({"git": ORIGIN["git"] | {"commit": "fedcba98"}}, "code differs: 0123456 of 'no | memory', "),
     ({"git": ORIGIN["git"] | {"commit": "fedcba98"}}, "; 0123456, fedcba9 of 'by position'"),
     ({"git": ORIGIN["git"] | {"dirty": True}}, "made by code with uncommitted changes: 'by position'"),
-    ({"cpu": "Another one"}, "; A processor, Another one of 'by position'"),
-    ({"gpu": "A card"}, "; none, A card of 'by position'"),
     ({"component_versions": {"vqvae": 2}}, "of vqvae differs: 1 of 'no | memory', 'full_model'; 2 of 'by po"),
     ({"sources": {"ik.py": "3"}}, "code of ik.py has changed since these runs"),
     ({"weights": "2" * 64}, "aaaaaaaaaaaaaaaa differs: 11111111 of "),
@@ -273,28 +265,6 @@ def test_prerequisite_runs_of_different_origin(flags: Callable[..., list[str]], 
     for change, words in CHANGED_PREREQUISITES:
         assert any(words in flag for flag in flags_upon(change)), words
         assert not any(words in flag for flag in before)
-
-
-def test_seeds_upon_other_weights_of_one_prerequisite(sweep: Sweep, tmp_path: Path):
-    """A training may have been resumed upon others. Kept results know them, too."""
-    weights: dict[int, list[str]] = {0: ["1"], 1: ["1", "2"], 2: []}
-
-    def run(variant, seed: int) -> Run:
-        runs = [PREREQUISITES | {"weights": 64 * one} for one in weights[seed]]
-        made = {"prerequisite": PREREQUISITES["id"], **({"prerequisite_runs": runs} if runs else {})}
-        return fake_run(tmp_path, variant.label, seed, origin=made)
-
-    def found(runs) -> list[str]:
-        flags = (flag for flag in make_table(sweep, runs).flags if "weights of" in flag)
-        return [flag.partition("differs: ")[2] for flag in flags]
-
-    runs = runs_of(sweep, run)
-    assert found(runs) == [f"11111111 of {EVERY}; 22222222 of {EVERY}"]
-    path = tmp_path / "kept.json"
-    path.write_text(format_results(KeptResults("table11", (), runs, {})))
-    assert found(load_kept_results(path).runs) == found(runs)
-    weights[1] = ["1"]
-    assert found(runs_of(sweep, run)) == []
 
 
 def test_runs_from_before_code_changed(flags: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch):
@@ -387,15 +357,6 @@ def test_intervals_of_one_seed_or_group(sweep, tmp_path, seeds, clips, expected)
         assert "*" not in printed(table, 100)
 
 
-def test_variants_that_share_a_single_seed(sweep: Sweep, tmp_path: Path):
-    find, kept = fake_sweep(tmp_path, sweep), {"full_model": (0, 1)}
-    table = table_of(
-        sweep, lambda variant, seed: find(variant, seed) if seed in kept.get(variant.label, (1, 2)) else None
-    )
-    (line,) = (flag for flag in table.flags if flag.startswith("one seed"))
-    assert line.endswith("about other clips alone, and nothing is significant: 'no | memory', 'by position'")
-
-
 def test_seeds_that_share_a_vqvae(flags: Callable[..., list[str]]):
     (flag,) = flags("share one VQ-VAE", lambda *_: {"origin": {"prerequisite": "v"}}, (0, 1))
     assert flag.endswith(EVERY)
@@ -420,7 +381,3 @@ def test_warnings_about_the_data(
     origin = {"origin": {fact: "a warning"}}
     found = flags("a warning", lambda label, _: origin if label != LABELS[0] else {})
     assert found == [f"a warning{ending}: 'by position', 'full_model'"]
-    runs = runs_of(replace(sweep, seeds=(0,)), lambda one, _: fake_run(tmp_path, one.label, **origin))
-    path = tmp_path / "kept.json"
-    path.write_text(format_results(KeptResults("5", (), runs, dict.fromkeys(LABELS, ()))))
-    assert {getattr(run.origin, fact) for run in load_kept_results(path).all_runs} == {"a warning"}

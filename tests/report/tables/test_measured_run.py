@@ -15,7 +15,6 @@ from memmlp.report.kept_results import KeptResults, format_results, load_kept_re
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.table_text import format_value
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import VERSIONS, hash_deployment_settings, list_outdated
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep
 
@@ -38,23 +37,6 @@ def test_size_and_times_are_of_the_precision_that_was_asked_for(sweep: Sweep, tm
     path.write_text(json.dumps(record))
     assert load_measured_run(run.folder).costs["size"] == 1.9
     assert not has_flag()
-
-
-def test_costs_of_an_earlier_recipe_are_known_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run, settings = fake_run(tmp_path, "run"), {"graph": "naive", "precision": "int8"}
-    before = load_measured_run(run.folder).origin.component_versions
-    path = run.deployment("fp32-0").latency
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"settings": settings}))
-    path.parent.rename(path.parent.with_name(hash_deployment_settings(settings)))
-    after = load_measured_run(run.folder).origin.component_versions
-    made_by = {name: number for name, number in after.items() if name not in before}
-    assert made_by.keys() == {"export", "latency", "graph.naive", "int8"}
-    number = made_by["latency"]
-    monkeypatch.setitem(VERSIONS, "latency", number + 1)
-    assert list_outdated(made_by) == [f"latency {number} -> {number + 1}"]
-    assert (
-        load_measured_run(run.folder).origin.component_versions == before
-    )  # by which numbers it was made, is not known
 
 
 def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):

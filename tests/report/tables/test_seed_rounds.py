@@ -11,7 +11,6 @@ from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import MeasuredRun, Origin
 from memmlp.report.tables.seed_rounds import Rounds, do_next_analysis, start_rounds
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table_text import to_markdown
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
 
@@ -133,23 +132,6 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
     assert cell.effect.is_significant
 
 
-def test_a_decided_comparison_of_an_open_variant_is_not_looked_at_again():
-    """The variant is worse in stream mode at three seeds and better later; window mode stays inconclusive."""
-    sweep = parse_sweep(
-        "mixed", {"seeds": [0], "metrics": ["MPJPE"], "variants": {"full": [], "other": ["a=1"]}}
-    )
-
-    def draw(label: str, seed: int, metric: str) -> np.ndarray:
-        if label == "full" or "window" in metric:
-            return planted({"other": "unsure"}.get(label, label), seed, metric)
-        return planted("worse", seed, metric) - 9 * (seed >= 3)
-
-    rounds = World(sweep, draw).to_the_end(start_rounds(sweep))
-    assert verdicts(rounds) == {"other": ("higher", 3)}
-    assert len(rounds.analyses) > 1
-    assert {finding.mode for look in rounds.analyses[1:] for finding in look.findings} == {"window"}
-
-
 def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
     few, many = World(), World()
     whole = start_rounds(SWEEP, 13)
@@ -193,23 +175,6 @@ def test_corrections_are_over_all_that_nobody_has_claimed():
     assert unsure[0].holm == pytest.approx(min(1, 4 * unsure[0].p))
     equivalent = [f.holm for f in first.findings if f.verdict is Verdict.EQUIVALENT]
     assert set(equivalent) == {1}  # closed to differences
-
-
-def test_the_table_shows_rounds():
-    world = World()
-    rounds = world.to_the_end(start_rounds(SWEEP, 5))
-    sweep = rounds.restrict_sweep(SWEEP)
-    table = make_table(sweep, world.runs, rounds=rounds)
-    assert [(len(row.found), len(row.wanted)) for row in table.rows[:4]] == [(5, 5), (3, 3), (3, 3), (5, 5)]
-    text = to_markdown(table)
-    for words in (
-        "higher (3)", "equivalent (3)", "analyses at 3 (1.7 %), 5 (3.3 %) seeds",
-        "p \\< the analysis' level by Holm's correction over the table's 6 comparisons",
-    ):  # fmt: skip
-        assert words in text
-    assert "missing" not in text
-    del world.runs["unsure"][6]
-    assert "'unsure' seed 6; fill with" in to_markdown(make_table(sweep, world.runs, rounds=rounds))
 
 
 @functools.cache

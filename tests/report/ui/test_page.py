@@ -7,12 +7,10 @@ from pathlib import Path
 
 import pytest
 from chromium import Browser
-from fake_runs import write_evaluation
 from report.ui.conftest import SEEDS, make_outputs, predict, run_of, started_run
 
 from memmlp.cli.sweep import analyse
 from memmlp.common.errors import InputError
-from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.seed_rounds import start_rounds
 from memmlp.report.ui.report_file import write_page
 from memmlp.report.ui.server import Answers, RunsServer
@@ -105,10 +103,6 @@ def test_a_run_s_page_and_its_replay(browser: Browser, server: RunsServer, home:
     assert browser.value("[...document.querySelectorAll('.view-name span')].map(s => s.textContent)") == [
         "Truth", "memory=gru · seed 0", "memory=none · seed 0",
     ]  # fmt: skip
-    corner = "(b => [b.x + 5, b.y + b.height / 2])(document.querySelector('.view').getBoundingClientRect())"
-    browser.value("document.querySelector('.views').scrollIntoView()")
-    x, y = map(round, browser.value(corner))
-    assert browser.picture()[y, x].tolist() == pytest.approx([238, 241, 244], abs=8)  # the stage's colour
     pieces = browser.value("[...document.querySelectorAll('.pieces button')].map(b => b.textContent)")
     assert pieces[0] == "Worst second at 5.0 s: 20.0 cm"
     browser.value("document.querySelector('.transport .primary').click()")
@@ -139,45 +133,6 @@ def test_a_sweep_s_effects_curves_and_rounds(browser: Browser, tmp_path: Path):
         rows = browser.value("[...document.querySelectorAll('.pair tbody tr')].map(r => r.textContent)")
         assert rows[0].startswith("3 seeds")
         assert "gru203\N{EN DASH}" in rows
-
-
-def scored(run: Run, **values: float) -> None:
-    """Add metrics to a run's evaluations, to means and clips alike."""
-    for path in run.evaluations.glob("*.json"):
-        report = json.loads(path.read_text())
-        for errors in (report["mean"], *report["clips"]):
-            errors["rotation"] |= values
-        write_evaluation(path, report)
-
-
-def test_units_and_directions_of_custom_metrics(browser, tmp_path: Path, monkeypatch):
-    monkeypatch.setitem(UNITS, "Score", "points")
-    monkeypatch.setattr("memmlp.report.tables.table_text.HIGHER", {"Score"})
-    make_outputs(tmp_path)
-    none, gru = (run_of(tmp_path, variant, 0) for variant in ("none", "gru"))
-    scored(none, Score=5.0, Odd=1.0)
-    scored(gru, Score=7.0, Odd=2.0)
-    with RunsServer(Answers(tmp_path, predict), 0) as running:
-        go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
-        rows = browser.value("[...document.querySelectorAll('.grid tbody tr')].map(r => r.textContent)")
-        (row,) = (row for row in rows if row.startswith("Score"))
-        assert row.startswith("Scorepoints ↑")
-        assert "7.00+2.00" in row
-        assert any(re.match(r"Odd[^a-z]*2.00\+1.00", row) for row in rows)  # no unit, no arrow
-        marked = (
-            "[...document.querySelectorAll('.grid td small')].filter(s => s.textContent == '{}')[0].className"
-        )
-        assert browser.value(marked.format("+2.00")) == "better"
-        assert browser.value(marked.format("+1.00")) == ""
-        go(browser, running.url, f"compare?runs={none.id},{gru.id}", f"{NAMES}.length == 2")
-        best = (
-            "(i => [...document.querySelectorAll('.runs tbody tr')].map(r => r.cells[i])"
-            ".filter(c => c.matches('.least')).map(c => c.textContent).join())"
-            "([...document.querySelectorAll('.runs thead th')].findIndex(h => /{}/.test(h.title)))"
-        )
-        assert browser.value(best.format("Score")) == "7.00"
-        assert browser.value(best.format("Odd")) == ""
-        assert browser.value(best.format("stream.rotation.MPJPE")) != ""
 
 
 def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, tmp_path: Path):
@@ -217,16 +172,6 @@ def test_data_is_never_markup_and_damage_is_shown(browser: Browser, server: Runs
     go(browser, server.url, f"run/{'0' * 16}", "document.querySelector('.warning')")
     words = browser.value("document.querySelector('.warning').textContent")
     assert "manifest.json: cannot be read" in words
-
-
-def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: RunsServer):
-    browser.size(390, 844)
-    for route in ("runs", "sweep/mine", "sweeps", "run/abcdef0123456789", "searches"):
-        go(browser, server.url, route, "document.querySelector('h1')")
-        assert browser.value("document.documentElement.scrollWidth") <= 390, route
-    go(browser, server.url, "runs", "document.querySelector('.runs thead th.n')")
-    assert browser.value("document.querySelector('.runs thead th.n').textContent") == "MPJPEstream, cm"
-    assert browser.value("document.querySelector('.runs thead th.n').getBoundingClientRect().right") <= 390
 
 
 def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):

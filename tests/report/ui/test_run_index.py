@@ -49,15 +49,6 @@ def test_damage_is_listed_and_raises_nothing(outputs: Path, name: str, content: 
     assert index.runs[run.id]["status"] == ("damaged" if damaged else "done")
 
 
-def test_a_folder_without_anything_is_a_new_run(outputs: Path):
-    (outputs / "runs" / ("0" * 16)).mkdir()
-    (outputs / "runs" / "no run").mkdir()
-    index = RunIndex(outputs)
-    index.refresh()
-    assert (index.runs["0" * 16]["status"], index.runs["0" * 16]["damage"]) == ("new", [])
-    assert "no run" not in index.runs
-
-
 def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     parsed = []
     monkeypatch.setattr(
@@ -95,11 +86,3 @@ def test_a_run_is_not_done_while_it_is_evaluated_or_once_its_deployment_failed(o
     assert (run.status, status()) == ("failed", "failed")
     run.retry()
     assert status() == "done"
-
-
-def test_last_entries_of_a_log_that_is_being_written(tmp_path: Path):
-    path = tmp_path / "metrics.jsonl"
-    assert read_facts(tmp_path)["recent"] == []
-    lines = [{"step": step, "phase": "train", "time": step, "values": {"loss": 1}} for step in range(9)]
-    path.write_text("\n".join(map(json.dumps, lines)) + '\n{"step": 9, "pha')
-    assert [entry[0] for entry in read_facts(tmp_path)["recent"]] == [4, 5, 6, 7, 8]

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import pytest
-from fake_logger import an_outdated_evaluation
 from own_package import registers_kept
 from report.ui.conftest import started_run
 
@@ -13,11 +11,9 @@ from memmlp.report.ui.runs import (
     count_partial_clips,
     describe_units,
     find_differing_keys,
-    list_outdated_modes,
     read_curves,
     thin_out,
 )
-from memmlp.runs.identity import VERSIONS
 from memmlp.runs.run import Run
 
 
@@ -52,18 +48,6 @@ def test_units_and_what_is_better_of_known_metrics():
             "median_ms": {"unit": "ms", "better": "lower"},
         }  # fmt: skip
     assert "Score" not in describe_units(metrics)
-
-
-def test_modes_of_an_earlier_component_version_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run = Run(tmp_path / ("a" * 16))
-    an_outdated_evaluation(run)
-    version = VERSIONS["mode.stream"]
-    assert list_outdated_modes(run) == [f"stream (mode.stream 0 -> {version})"]
-    monkeypatch.setitem(VERSIONS, "mode.stream", 0)
-    assert list_outdated_modes(run) == []
-    monkeypatch.undo()
-    run.config_path.write_text("[")
-    assert list_outdated_modes(run) == []
 
 
 def test_curves_follow_a_log_that_is_being_written(tmp_path: Path):

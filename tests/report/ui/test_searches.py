@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_search import director, finish, open_study, to_the_end, with_a_pruned_trial
+from fake_search import director, finish, open_study, with_a_pruned_trial
 
 from memmlp.common.files import write_json
 from memmlp.report.ui.searches import Searches
@@ -39,15 +39,6 @@ def test_a_search_in_a_custom_storage_is_read_again(folder: Path, tmp_path: Path
     one.update(1).save(plan)
     assert searches.describe("mine")["counts"] == {"complete": 1, "running": 1}
     assert searches.make_stamp() != before
-
-
-def test_of_few_trials_it_says_why_there_is_no_importance(folder: Path):
-    study = open_study(folder, n_trials=2)
-    write_json(folder / "search.json", asdict(study.search))
-    to_the_end(study, folder)
-    page = Searches(folder.parents[1]).describe("mine")
-    assert page["importance"] == []
-    assert page["too_few"].startswith("needs 25 complete trials; with 2")
 
 
 @pytest.mark.parametrize("changes", [{"storage": 5}, {"name": []}, {"objectives": None}, {"space": [[]]}])

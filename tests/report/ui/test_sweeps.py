@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_runs import fake_run, write_evaluation
+from fake_runs import fake_run
 from report.ui.conftest import predict, run_of
 
 from memmlp.cli.sweep import analyse
@@ -77,15 +77,6 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite
     assert said == "trained, an evaluation or export is missing"
 
 
-def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
-    run = run_of(outputs, "gru", 2)
-    with run.lock():
-        run.attempt("evaluation")
-        found = describe(sweeps_of(outputs))
-    assert (found["counts"], found["remaining"]) == ({"done": 5, "evaluating": 1}, None)
-    assert 0.999 < found["share"] < 1
-
-
 def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
     """A sweep with another control has another table, though the runs stay as they are."""
     folder, run, sweeps = outputs / "sweeps" / "mine", run_of(outputs, "gru", 0), sweeps_of(outputs)
@@ -99,22 +90,6 @@ def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
     (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
     assert cell["value"] == pytest.approx(run.results["stream"]["combined"]["MPJRE"])
     assert sweeps.refresh() != before
-
-
-def test_variants_of_one_training_have_each_the_value_of_their_own_evaluation(outputs: Path):
-    """A network may be used in another way, such as with another estimate of its past."""
-    run, path = run_of(outputs, "gru", 0), outputs / "sweeps" / "mine" / "plan.json"
-    report = json.loads(run.evaluation("stream-0").read_text())
-    report["mean"]["rotation"]["MPJPE"] += 7.0
-    report["settings"] = {"memory.blend": 0.25}  # is no evaluation of the run's own config
-    write_evaluation(run.evaluation("stream-1"), report)
-    plan = json.loads(path.read_text())
-    for planned in (*plan["entries"], *plan["tasks"]):
-        if planned["id"] == run.id:
-            planned["stages"] = ["stream-1"]
-    path.write_text(json.dumps(plan))
-    (cell,) = [cell for cell in describe(sweeps_of(outputs))["cells"] if cell["id"] == run.id]
-    assert cell["value"] == pytest.approx(report["mean"]["rotation"]["MPJPE"])
 
 
 def test_a_run_s_control_is_that_of_its_variant(outputs: Path):

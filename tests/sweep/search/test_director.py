@@ -1,6 +1,6 @@
 """The director: trials counted, pruned, failed and resumed, with runs written by the tests."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from memmlp.sweep.plan import RunTask
 from memmlp.sweep.search import study as study_module
 from memmlp.sweep.search.progress_table import format_objectives
 from memmlp.sweep.search.search_file import Value
-from memmlp.sweep.search.study import Study
 
 
 def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
@@ -110,29 +109,6 @@ def test_values_that_make_no_sense_fail_their_trial_and_hopeless_searches_end(tm
         fake_search.director(fake_search.open_study(tmp_path, n_trials=20), tmp_path, refuse).update(2)
 
 
-def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Path):
-    space = {"hand": {"choices": ["off", "fk"]}}
-    study = fake_search.open_study(tmp_path, space=space, pruner="median", prune_after=1, n_trials=12)
-    one = fake_search.director(study, tmp_path)
-    seen = set()
-    for _ in range(12):
-        plan = one.update(1)
-        if not plan.tasks:
-            break
-        assert not {task.id for task in plan.tasks} & set(plan.cancelled)
-        (task,) = plan.tasks
-        seen.add(task.id)
-        run = plan.get_run(task)
-        if not run.done:
-            run.begin("memmlp", task.config, data="d", prerequisite=None)
-            fake_search.log(run, 10, 5.0 if not seen - {task.id} else 9.0)
-            one.update(1)
-            if study.trials[-1].state != TrialState.PRUNED and not run.done:
-                fake_search.log(run, fake_search.STEPS, 5.0)
-                run.finish([])
-    assert all(trial.state.is_finished() for trial in study.trials[:-1])
-
-
 def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
     study = fake_search.open_study(tmp_path, seeds=3, n_trials=2)
     one = fake_search.seeded(study, tmp_path)
@@ -180,28 +156,3 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
     assert run.id in plan.cancelled
     assert study.trials[-2].state == TrialState.PRUNED
     assert study.trials[-2].user_attrs["runs"] == [run.id]
-
-
-def test_validations_of_a_network_used_otherwise_are_no_trials(tmp_path: Path):
-    """The blend acts when the network is used: the run is the same, what it logged is not."""
-
-    def blended(value: float) -> Callable:
-        def composed(values: Mapping[str, Value]) -> list[list[RunTask]]:
-            ((task,),) = fake_search.compose(values)
-            return [[replace(task, config={**task.config, "memory": {"blend": value}})]]
-
-        return composed
-
-    for value, state in ((0.5, "COMPLETE"), (0.1, "FAIL")):
-        folder = tmp_path / f"blend {value}"
-        folder.mkdir()
-        study = Study.open(fake_search.search(n_trials=1), folder.name, folder)
-        one = fake_search.director(study, tmp_path, blended(value))
-        while (plan := one.update(1)).tasks:
-            fake_search.finish(plan)
-        (trial,) = study.trials
-        assert trial.state.name == state
-    assert (
-        "was validated with {'memory.blend': 0.5}; expected {'memory.blend': 0.1}"
-        in trial.user_attrs["reason"]
-    )

@@ -48,20 +48,6 @@ def test_a_pruned_trial_has_no_value_in_the_csv(tmp_path: Path):
     assert (second["state"], second["MPJPE"], second["reason"]) == ("pruned", "", "9 at step 10")
 
 
-def test_a_trial_that_is_no_longer_of_the_front_has_no_file(tmp_path: Path):
-    study = fake_search.open_study(tmp_path, objectives=["MPJPE", "Jitter"], n_trials=3)
-    one = fake_search.director(study, tmp_path)
-    for errors in ((1.0, 3.0), (3.0, 1.0), (0.5, 0.5)):
-        run = fake_search.begun(one.update(1))
-        run.log(
-            fake_search.STEPS, dict(zip(("rotation MPJPE", "rotation Jitter"), errors, strict=True)), "val"
-        )
-        run.finish([])
-        one.update(0)
-        results.write_experiments(study, tmp_path, ["loss"])
-    assert [path.name for path in (tmp_path / "experiment").iterdir()] == ["best.yaml"]
-
-
 @pytest.mark.slow
 def test_two_objectives_give_a_front(tmp_path: Path):
     study = fake_search.open_study(tmp_path, objectives=["MPJPE", "Jitter"])
@@ -121,15 +107,11 @@ def test_of_a_key_in_the_base_and_the_trial_the_trials_value_is_written(tmp_path
 
 @pytest.mark.parametrize(("tried", "values", "said"), [
     ({"choices": (0.001, 0.002, 0.008)}, [0.001, 0.002, 0.008], "0.008, is the largest"),
-    ({"choices": (0.001, 0.002, 0.008, 0.016)}, [0.001, 0.002, 0.016, 0.008], None),
     ({"choices": (0.008, 0.016, 0.004)}, [0.016, 0.008, 0.004], "0.004, is the smallest"),
     ({"choices": (0.0, 0.1, 0.2)}, [0.2, 0.1, 0.0], None),  # nothing lies beyond zero
     ({"choices": (False, True)}, [True, False], None),
-    ({"choices": ("a", "b", 3)}, ["a", "b", 3], None),
     ({"low": 1e-4, "high": 1e-2, "log": True}, [1e-3, 9.5e-3], "0.0095, is the largest"),
-    ({"low": 1e-4, "high": 1e-2, "log": True}, [9.5e-3, 5e-3], None),
     ({"low": 1e-4, "high": 1e-2}, [9.5e-3, 2.9e-4], "0.00029, is the smallest"),
-    ({"low": 2, "high": 6}, [4, 2, 6], "6, is the largest"),
 ])  # fmt: skip
 def test_a_best_value_boundary_warnings_of_what_was_tried_is_told(tried, values, said):
     """The last value is the best: so is a network tuned that is not, and looks it."""

@@ -1,7 +1,6 @@
 """The study survives kills, proposes the same again, and says what it cannot read."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -121,19 +120,3 @@ def test_what_is_no_journal_is_left_alone_and_named(tmp_path: Path, content: byt
         with pytest.raises(InputError, match=r"study.journal: must be an Optuna journal"):
             look(tmp_path)
     assert journal_path(tmp_path).read_bytes() == content
-
-
-def test_a_trial_that_was_killed_between_its_values_gets_the_same_ones(tmp_path: Path, monkeypatch):
-    """The first owner is killed after the first value of its second trial."""
-    folders = [tmp_path / name for name in ("whole", "killed")]
-    for folder in folders:
-        folder.mkdir()
-    whole, killed = (open_study(folder, sampler="random", startup=None) for folder in folders)
-    expected = [whole.ask().params for _ in range(2)]
-    killed.ask()
-    with monkeypatch.context() as patched:
-        patched.setattr(killed, "search", replace(killed.search, space=killed.search.space[:1]))
-        killed.ask()
-    again = open_study(folders[1], sampler="random", startup=None)
-    list(again.list_running())
-    assert [trial.params for trial in again.trials] == expected
