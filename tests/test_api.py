@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 import yaml
 from own_package import registers_kept
-from PIL import Image
 
 import memmlp
 from memmlp.common.files import read_json, write_json
@@ -220,42 +219,6 @@ def test_user_code_runs_only_if_the_script_names_its_package(three, tmp_path: Pa
     ):
         with pytest.raises(memmlp.InputError, match=said):
             memmlp.load_run(path.parent, plugins=plugins)
-
-
-def test_pictures_films_and_what_is_refused_of_them(prediction: memmlp.Prediction, tmp_path: Path):
-    for name, options, words in (
-        ("a.avi", {}, ("path ", "a.avi", ".png, .gif, .mp4")), ("no/a.png", {}, ("path ", "no")),
-        ("a.png", {"branch": "combined"}, ("branch combined", "rotation, position")),
-        ("a.png", {"begin": 900}, ("begin 900",)), ("a.png", {"begin": -1}, ("begin -1",)),
-        ("a.png", {"begin": float("nan")}, ("begin nan",)),
-        ("a.png", {"begin": 1, "end": 1}, ("begin 1 end 1",)),
-        ("a.png", {"begin": 0.501, "end": 0.505}, ("begin 0.501 end 0.505",)),
-        ("a.png", {"poses": 0}, ("poses 0", "1 to 20")),
-    ):  # fmt: skip
-        with refused(*words):
-            prediction.draw(tmp_path / name, **options)
-    with refused("path ", "a.fbx", ".bvh, .npz, .glb"):
-        prediction.save(tmp_path / "a.fbx")
-    assert list(tmp_path.iterdir()) == []
-    one, two = (prediction.draw(tmp_path / f"{n}.png", poses=n) for n in (1, 2))
-    assert one == tmp_path / "1.png"
-    with Image.open(one) as narrow, Image.open(two) as wide:
-        assert wide.size[0] > narrow.size[0]
-    assert prediction.draw(tmp_path / "3.png", poses=1, branch="position").read_bytes() != one.read_bytes()
-    with Image.open(prediction.draw(str(tmp_path / "film.gif"), begin=0.5, end=0.6)) as film:
-        assert film.n_frames == 3
-
-
-def test_motion_is_saved_as_bvh_gltf_and_npz(prediction: memmlp.Prediction, tmp_path: Path):
-    for name in ("a.bvh", "deep/a.glb", "a.npz"):
-        assert prediction.save(tmp_path / name) == tmp_path / name
-    assert (tmp_path / "a.bvh").read_text().startswith("HIERARCHY\nROOT pelvis\n")
-    assert (tmp_path / "deep" / "a.glb").read_bytes()[:4] == b"glTF"
-    prediction.save(str(tmp_path / "truth.npz"), truth=True)
-    for name, positions in (("a", prediction.positions), ("truth", prediction.true_positions)):
-        with np.load(tmp_path / f"{name}.npz") as file:
-            np.testing.assert_allclose(file["trans"] + prediction.rest[0], positions[:, 0], atol=1e-6)
-            assert (file["poses"].shape, float(file["mocap_framerate"])) == ((len(prediction), 156), 60)
 
 
 def test_a_run_streams(run: memmlp.TrainedRun, three: memmlp.Runs):

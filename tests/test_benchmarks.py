@@ -2,27 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from benchmarks import few_groups, verdicts
 from benchmarks.verdicts import Shares, Simulated, SimulationSetting
 from memmlp.report.tables.statistics import estimate_error
-
-
-def test_means_of_few_groups_have_a_variance_of_one():
-    for shape in set(few_groups.SHAPES) - {"heavy tails"}:  # whose sample variances vary without limit
-        for shares in few_groups.SHARES:
-            drawn = few_groups.draw_differences(np.random.default_rng(2), 8000, 3, 9, shape, shares)
-            assert drawn.mean((1, 2)).var() == pytest.approx(1, abs=0.1), (shape, shares)
-
-
-def test_flips_are_the_exact_test_and_the_bootstrap_is_near_students():
-    sample = np.random.default_rng(4).normal(0.5, 1, 9)
-    p = few_groups.compute_resampled_p(np.random.default_rng(0), sample[None])
-    known = stats.permutation_test((sample,), np.mean, permutation_type="samples", n_resamples=np.inf)
-    assert p["flips"][0] == pytest.approx(known.pvalue)
-    for name in ("flips of skew-corrected t", "bootstrap-t"):
-        assert p[name][0] == pytest.approx(stats.ttest_1samp(sample, 0).pvalue, abs=0.05)
 
 
 def test_p_keeps_its_level_and_resampling_does_not():
@@ -49,15 +32,6 @@ def test_mixed_effects_equal_simulated_differences(cell: SimulationSetting):
         np.testing.assert_allclose(known.variances, expected.variances)
         assert (known.seeds, known.groups) == (expected.seeds, expected.groups)
         np.testing.assert_allclose(mean, differences[:, :seeds].mean((1, 2)))
-
-
-def test_means_have_a_variance_of_one():
-    sample = Simulated(np.random.default_rng(0), SimulationSetting(3, 11, 2), 24000)
-    for name, shares in verdicts.SHARES.items():
-        known, mean = sample.mixed(shares, 3)
-        assert mean.var() == pytest.approx(1, abs=0.06), name
-        a, b, e = known.variances.mean(1)
-        assert a + b - e == pytest.approx(1, abs=0.06 if shares.groups else 0.2), name
 
 
 def test_a_cell_is_reproducible_and_broken_promises_are_listed():

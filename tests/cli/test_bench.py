@@ -4,14 +4,10 @@ import json
 
 import numpy as np
 import pytest
-import tiny
-import torch
 from conftest import Memmlp, one_line
-from torch import Tensor, nn
 
 from memmlp.cli.bench import GRAPHS, summarize
 from memmlp.deploy.latency import RoundTimes
-from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 
 BENCHED = ["profile=tiny", "model.depth=2", "model.heads=4"]
 
@@ -24,46 +20,6 @@ def test_a_summary_by_hand():
     assert [found[f"pose_ratio_{key}"] for key in ("least", "most")] == [1, 3]
     assert found["pose_ratio_to_avatar_poser"] == pytest.approx(2)
     assert found["pose_core_share"] == 0.7
-
-
-class TorchAvatarPoser(nn.Module):
-    def __init__(self, width: int, depth: int, heads: int, feedforward: int):
-        super().__init__()
-        self.embedding = nn.Linear(SPARSE_DIM, width)
-        layer = nn.TransformerEncoderLayer(width, heads, feedforward, batch_first=True)
-        self.encoder = nn.TransformerEncoder(layer, depth)
-        self.orientation = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6))
-        self.rotation = nn.Sequential(
-            nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6 * (N_JOINTS - 1))
-        )
-
-    def forward(self, window: Tensor) -> Tensor:
-        newest = self.encoder(self.embedding(window))[:, -1]
-        return torch.cat([self.orientation(newest), self.rotation(newest)], -1)
-
-
-@torch.no_grad()
-def test_avatar_poser_is_the_network_of_torch_layers():
-    ours = tiny.baseline("avatar_poser")
-    weights = {
-        name: value
-        for name, value in ours.state_dict().items()
-        if not name.startswith(("normalizer", "layers"))
-    }
-    for i, layer in enumerate(ours.layers):
-        parts = (layer.attention.query, layer.attention.key, layer.attention.value)
-        others = {
-            "self_attn.out_proj": layer.attention.out, "linear1": layer.widen, "linear2": layer.narrow,
-            "norm1": layer.attention_norm, "norm2": layer.norm,
-        }  # fmt: skip
-        for kind in ("weight", "bias"):
-            start = f"encoder.layers.{i}."
-            weights[f"{start}self_attn.in_proj_{kind}"] = torch.cat([getattr(part, kind) for part in parts])
-            weights |= {f"{start}{name}.{kind}": getattr(part, kind) for name, part in others.items()}
-    theirs = TorchAvatarPoser(width=16, depth=2, heads=4, feedforward=32).eval()
-    theirs.load_state_dict(weights)
-    window = torch.randn(1, 7, SPARSE_DIM)
-    torch.testing.assert_close(theirs(window), ours.predict_rotations(window), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.long

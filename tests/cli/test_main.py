@@ -1,7 +1,6 @@
 """The command itself: quick help, exit codes, one line an error, Hydra's own abilities."""
 
 import errno
-import os
 import signal
 import sys
 from pathlib import Path
@@ -34,19 +33,6 @@ def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: p
     )
     main(["train", "profile=tiny"])
     assert seen == [before]
-
-
-def test_waiting_threads_sleep_in_a_process_of_the_command(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sys, "argv", ["memmlp", "train", "profile=tiny"])
-    seen: list[str | None] = []
-    monkeypatch.setattr(
-        "memmlp.cli.train.run_training", lambda cfg: seen.append(os.environ.get("OMP_WAIT_POLICY"))
-    )
-    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
-    main()
-    monkeypatch.delenv("OMP_WAIT_POLICY")
-    main()
-    assert seen == ["ACTIVE", "PASSIVE"]
 
 
 def export(*_: object) -> None:

@@ -8,13 +8,6 @@ import pytest
 from conftest import Memmlp, Ran, one_line
 
 from memmlp.common.files import write_json
-from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import (
-    VERSIONS,
-    find_evaluation_versions,
-    hash_evaluation_settings,
-    select_evaluation_settings,
-)
 from memmlp.runs.run import Run
 
 A, B, C = ("a" * 16, "b" * 16, "c" * 16)
@@ -84,23 +77,6 @@ def test_diff(memmlp: Memmlp, outputs: Path):
     assert one_line(memmlp("runs", "diff", "a", "zz"), "run 'zz'")
 
 
-def test_list_names_the_networks_that_hardly_saw_motion(memmlp: Memmlp, outputs: Path):
-    said = "hardly trained, ignore the errors:"
-    assert said not in memmlp("runs", "list").out
-    little = {"model": {"frames": 41}, "optim": {"steps": 20, "batch": 8}}
-    for digit in "de":
-        run = Run.from_id(outputs, digit * 16)
-        run.begin("memmlp", little, data="d" * 64, prerequisite=None)
-        if digit == "d":
-            write_json(run.results_path, RESULTS)
-            run.finish(["results.json"])
-    assert f"{said} dddddddd\n" in memmlp("runs", "list").out
-    assert "run dddddddd: hardly trained" in memmlp("runs", "diff", "a", "d").out
-    for name in (A, B):
-        Run.from_id(outputs, name).config_path.write_text(json.dumps(little))
-    assert f"{said} all finished runs\n" in memmlp("runs", "list").out
-
-
 def test_diff_names_component_versions_and_devices_and_leaves_out_what_changes_no_result(memmlp, outputs):
     facts = (
         (A, "vq", "fast", {"component_versions": {"features": 1, "memory.vq": 1}, "device": "cpu"}),
@@ -121,27 +97,6 @@ def test_diff_names_component_versions_and_devices_and_leaves_out_what_changes_n
     ):  # fmt: skip
         assert row in rows(ran), row
     assert not re.search(r"threads|on fast|settings|memory\.vq", ran.out)
-
-
-def test_results_by_an_earlier_recipe_are_told(memmlp, outputs: Path, monkeypatch):
-    """They stood beside those of today's; of a run that was measured again today's count."""
-    for number, measured in ((1, (A, B)), (VERSIONS["mode.window"], (B,))):
-        monkeypatch.setitem(VERSIONS, "mode.window", number)
-        for name in measured:
-            settings = select_evaluation_settings({}, "window")
-            report = {
-                "mode": "window",
-                "settings": settings,
-                "component_versions": find_evaluation_versions(settings),
-            }
-            report |= {"mean": {"rotation": {"MPJPE": 5.0 + number}}, "clips": []}
-            write_report(Run.from_id(outputs, name).evaluation(hash_evaluation_settings(settings)), report)
-    said = f"by an earlier version: mode.window 1 -> {number}"
-    listed = memmlp("runs", "list").out
-    assert f"window results {said}; measure again with memmlp eval RUN: {A[:8]}\n" in listed
-    assert f"window results {said}" in " ".join(memmlp("runs", "show", A).out.split())
-    assert "earlier version" not in memmlp("runs", "show", B).out
-    assert f"window results {said} -" in " ".join(memmlp("runs", "diff", A, B).out.split())
 
 
 def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):

@@ -180,13 +180,6 @@ def test_what_is_kept_says_that_seeds_were_spent_in_rounds(memmlp: Memmlp, runs:
     assert find_exceeding() == ["chosen", "trial"]
 
 
-def test_inconclusive_verdicts_are_not_called_decided(memmlp: Memmlp, runs: Runs):
-    write(VARIANTS, smallest={"MPJPE": 0.01})
-    out = memmlp(*SWEEP, "--max-seeds", "5").out
-    assert analysed() == [(3, ["same", "worse"]), (5, ["same"])]
-    assert "all verdicts are decided" not in out
-
-
 @pytest.mark.slow
 def test_failed_runs_are_late_and_made_up_for(memmlp: Memmlp, runs: Runs):
     runs.failing = {"worse"}
@@ -198,19 +191,6 @@ def test_failed_runs_are_late_and_made_up_for(memmlp: Memmlp, runs: Runs):
     runs.failing = set()
     assert (memmlp(*SWEEP).code, memmlp(*SWEEP, "--retry").code) == (1, 0)
     assert analysed()[-1] == (3, ["worse"])
-
-
-def test_status_and_dry_run_say_the_schedule(memmlp: Memmlp, runs: Runs):
-    out = memmlp(*SWEEP, "--dry-run", "--max-seeds", "5", "--workers", "2").out
-    assert "analyses at 3 (1.7 %), 5 (3.3 %) seeds, with a total error rate of 5 %" in out
-    assert "9 of 9 runs to do, 2 at once" in out
-    assert re.search(r"^same +0 +0 +3 +at 3$", out, re.M)
-    assert not runs.made
-    runs.patience = 10
-    memmlp(*SWEEP)
-    out = memmlp(*SWEEP, "--status").out
-    assert re.search(r"^same +0 +2 +5 +at 5$", out, re.M)
-    assert len(runs.made) == 10
 
 
 def test_bad_combinations_are_one_line(memmlp: Memmlp, runs: Runs):

@@ -2,13 +2,11 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import pytest
 from fake_runs import fake_run
 
-from memmlp.cli.train_summary import describe_latency, make_all_metrics_tables, show, show_side_by_side
+from memmlp.cli.train_summary import describe_latency, make_all_metrics_tables, show
 from memmlp.runs.evaluation_file import write_report
 from memmlp.training.request import Outcome
 
@@ -69,16 +67,3 @@ def test_an_int8_file_that_is_not_used_live_is_told():
         cost = TIMES | {"onnx_bytes": 600_000, "growth": 0.0016, "jitter_growth": jitter}
         said = latency({"settings": {"precision": "int8"}, "int8": cost})
         assert ("Jitter +35.6%" in said) == ("memmlp live uses float32" in said) == (jitter > 0.1)
-
-
-def test_side_by_side_shows_each_branch_that_differs(capsys: pytest.CaptureFixture[str]):
-    """A network that predicts positions, too, is not compared by its rotations alone."""
-    two = {"rotation": {"MPJRE": 2.0, "MPJPE": 6.49}, "position": {"MPJPE": 5.46}}
-    one = {"rotation": {"MPJRE": 3.0, "MPJPE": 4.8}, "position": {"MPJPE": 4.8 * (1 + 1e-6)}}
-    outcomes = {"two": {"stream": two}, "one": {"stream": one}}
-    show_side_by_side({name: cast(Outcome, SimpleNamespace(results=own)) for name, own in outcomes.items()})
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["two", "two"] in lines
-    assert ["metric", "unit", "rotation", "position", "one"] in lines
-    assert ["MPJPE", "cm", "6.49", "5.46", "4.80"] in lines
-    assert ["MPJRE", "deg", "2.00", "-", "3.00"] in lines

@@ -14,7 +14,6 @@ from benchmarks.chaos import examine
 from memmlp.cli.tune import prepare_search, search
 from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError
-from memmlp.runs.identity import VERSIONS
 from memmlp.runs.run import Run
 from memmlp.sweep.search import director as director_module
 from memmlp.sweep.search.director import Director
@@ -76,16 +75,10 @@ def test_searches_of_one_and_of_two_seeds_share_the_first_seeds_runs(home: Path,
 
 
 BAD_SEARCHES = {
-    "search.n_trial=3": "n_trial", "search.n_trials=0": "search.n_trials=0: ", "search=losses": "losses",
     "search.space.loss.rotation_all.low=-1": "search.space.loss.rotation_all.low=-1: ",
-    "+search.space.optim.lrr={low: 0.1, high: 1.0}": "optim.lrr",
     "+search.space.optim.batch={low: -4, high: 8}": "search.space: optim.batch=-4: ",
-    "optim.lr=-1": "memmlp: optim.lr=-1", "loss.rotation_all=5": "loss.rotation_all=5: is searched",
     "+search.space.memory.blend={low: 0.0, high: 1.0}": "search.space.memory.blend: ",
-    "+search.space.data.split.seed={low: 0, high: 9}": "search.space: data.split.seed changes ",
     "+search.space.data={choices: [synth, mocap], first: synth}": "search.space: ",
-    "~search": "search: must be the name", "~search.n_trials": "search.n_trials: has no value",
-    "+search.nonsense=1": "search.nonsense: no such key", "executor=cloud": "executor=cloud: ",
     "executor=debug": "executor=debug: ",
 }  # fmt: skip
 
@@ -135,21 +128,6 @@ def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(InputError, match="mine: clips have changed since the search started"):
         search(setup, study, Workers())
     assert len(study.trials) == 1
-
-
-def test_a_search_is_named_after_what_later_trials_follow_from_too(tmp_path: Path, monkeypatch):
-    """The first trial has no memory, and so no VQ-VAE; a component that no trial uses changes nothing."""
-    space = ["search.space.loss=null", "+search.space.memory={choices: [none, vq], first: none}"]
-
-    def folder(*words: str) -> str:
-        return prepare_search([*TINY, *space, *words], None, tmp_path).folder.name
-
-    before = folder()
-    assert folder("vqvae.lr=1e-1") != before
-    for component, same in {"memory.gru": True, "memory.vq": False, "codebook.ema": False}.items():
-        with monkeypatch.context() as patched:
-            patched.setitem(VERSIONS, component, 99)
-            assert (folder() == before) == same
 
 
 def test_a_folder_of_ones_own_searches(tmp_path: Path):

@@ -4,12 +4,10 @@ import random
 import shutil
 from pathlib import Path
 
-import pytest
 from begun_runs import complete
-from conftest import Memmlp, one_line
+from conftest import Memmlp
 
 from memmlp.common.errors import InputError
-from memmlp.config import plugins
 from memmlp.config.compose_plan import find_sweep, get_sweep_folder
 from memmlp.runs.archive import export_run, import_run
 from memmlp.runs.lookup import list_runs
@@ -44,15 +42,6 @@ def test_sweep_files_of_any_name_have_a_folder_each(tmp_path: Path):
         assert folder.resolve().parent == tmp_path / "sweeps"
         folders[folder] = sweep.name
     assert len(folders) > 100
-
-
-def test_packages_of_any_name_are_refused_in_one_line(memmlp: Memmlp, tmp_path: Path):
-    for name in make_names():
-        with pytest.raises(InputError):
-            plugins.activate([name])
-    for name in make_names(20):
-        if plugins.split_names(name):
-            assert one_line(memmlp("sweep", "14", "--plugins", name, "--status"), "plugin"), name
 
 
 def test_folders_of_any_name_keep_their_runs(memmlp: Memmlp, tmp_path: Path):

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from email.message import Message
-from unittest.mock import Mock
 from urllib.parse import quote
 
 import pytest
@@ -22,7 +21,6 @@ from memmlp.common.page_server import (
     PageHandler,
     PageServer,
     check_token,
-    find_own_address,
     is_loopback,
 )
 
@@ -195,10 +193,3 @@ def test_open_pages_leave_room_for_other_requests(monkeypatch: pytest.MonkeyPatc
         assert ask(server)[0] == 503
         assert ask(server, "POST") == (200, pytest.approx(0, abs=1))
         stopped.set()
-
-
-def test_the_printed_address_is_this_machine_s(monkeypatch: pytest.MonkeyPatch):
-    with PageServer(Handler, 0, "0.0.0.0") as server:
-        assert f"http://{find_own_address()}:{server.server_port}/?token=" in server.url
-    monkeypatch.setattr(page_server.socket.socket, "connect", Mock(side_effect=OSError(101, "no route")))
-    assert find_own_address() == socket.gethostname()

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import functools
-from collections.abc import Iterator
-from pathlib import Path
-from tempfile import mkdtemp
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import tiny
@@ -18,98 +13,15 @@ from memmlp.config.build import build_experiment, make_readable_name
 from memmlp.config.compose import compose_config
 from memmlp.deploy.export import export
 from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
-from memmlp.evaluation import modes as evaluation
-from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.runs.run import Run
-from memmlp.training.run_stages import Experiment, make_prerequisites
-from memmlp.training.train_network import TrainingJob
+from memmlp.training.run_stages import Experiment
 
 TINY = [
     "profile=tiny", "data.synth.minutes=0.1", "loggers=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
     "optim.batch=4", "model.width=8", "memory.width=4", "vqvae.width=8", "evaluation.ik_iterations=2",
 ]  # fmt: skip
 SMALL = ["model.frames=5", "model.depth=2", "memory.layers=[2]", "predictor.depth=1"]  # unless an axis
-
-# By axis: the keys beside it and its values, the first of which is the base. What follows a comma is no key.
-# Keys with numbers are changed in tests/training/test_experiment.py.
-TRAINED: dict[str, tuple[list[str], str]] = {
-    "memory": (SMALL, "vq no_codes none vq_joint lstm gru"),
-    "predictor": (
-        [*SMALL, "hand=fk"], "two_branch two_branch_memory rotation_only rotation_only_memory"
-    ),
-    "rollout": (SMALL, "teacher_forcing own_predictions streams"),
-    "loss": (SMALL, "uncertainty manual"),
-    "hand": (SMALL, "position fk off"),
-    "evaluation.ik": (SMALL, "off lbfgs arms"),
-}  # fmt: skip
-
-
-class Arm(NamedTuple):
-    model: MemMLP
-    values: list[dict[str, float]]
-    motion: torch.Tensor
-    results: dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder whose outputs the tests share; pieces to validate on are a second long."""
-    folder = tmp_path_factory.mktemp("axes")
-    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
-        patch.setattr("memmlp.training.train_network.VALIDATION_PIECE", 60)
-        yield folder
-
-
-@functools.cache
-def trained(*overrides: str) -> Arm:
-    """Two steps, a validation, and the first test clip evaluated as the config says."""
-    experiment = build_experiment(compose_config(overrides))
-    data = experiment.motion.prepare()
-    above = make_prerequisites(experiment, data)
-    run = Run(Path(mkdtemp(dir=".", prefix="arm-")))
-    weights = above.model if above else None
-    experiment.training.train(TrainingJob(experiment.architecture, data, weights, run, experiment.device))
-    model = experiment.architecture.load(run.model)
-    test = data.open("test")
-    short = MotionDataset(test.frames[:12], torch.tensor([0]), torch.tensor([12]), test.names[:1])
-    settings = experiment.evaluation
-    results = {mode: settings.report(model, short, mode)["mean"] for mode in settings.modes}
-    torch.manual_seed(0)
-    motion = evaluation.predict_stream(model, [short.frames])[0]
-    return Arm(model, [entry.values for entry in run.metrics()], motion, results)
-
-
-def variants(axis: str) -> list[list[str]]:
-    """The command lines of an axis' values; keys that a value's memory has not are left out."""
-    beside, values = TRAINED[axis]
-    words = [f"{axis.partition(',')[0]}={value}" for value in values.split()]
-    return [
-        [text for text in (*TINY, *beside, word) if word != "memory=none" or not text.startswith("memory.")]
-        for word in words
-    ]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "axis", ["memory", *(pytest.param(axis, marks=pytest.mark.long) for axis in list(TRAINED)[1:])]
-)
-def test_every_value_trains_streams_and_changes_something(axis, home):
-    base, *others = (trained(*words) for words in variants(axis))
-    for arm in (base, *others):
-        assert arm.motion.shape == (12, 198)
-        assert torch.isfinite(arm.motion).all()
-        assert [torch.isfinite(torch.tensor([*values.values()])).all() for values in arm.values] == [True] * 2
-    for value, arm in zip(variants(axis)[1:], others, strict=True):
-        same = shapes(base.model) == shapes(arm.model) and base.values[0] == arm.values[0]
-        branches = [{mode: set(of) for mode, of in one.results.items()} for one in (base, arm)]
-        same = same and branches[0] == branches[1] and torch.allclose(base.motion, arm.motion, atol=1e-6)
-        assert not same, value
-
-
-def shapes(model: MemMLP) -> dict[str, torch.Size]:
-    return {name: tensor.shape for name, tensor in model.state_dict().items()}
 
 
 EXPORTED = [

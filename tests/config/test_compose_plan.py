@@ -6,38 +6,9 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.config import plugins
 from memmlp.config.build_request import build_request, build_requests
 from memmlp.config.compose import compose_config
 from memmlp.config.compose_plan import find_sweep, get_sweep_folder
-
-NESTED = {
-    "inner": "defaults: [{override /memory: gru}]\nmodel: {width: 24}\n",
-    "middle": "defaults: [inner]\n",
-    "outer": "defaults: [middle, {override /loss: manual}]\noptim: {batch: 7}\n",
-    "absolute": "defaults: [/experiment/inner]\n",
-    "several": "defaults: [{/experiment@_global_: [inner, no_memory]}]\n",
-}
-
-
-@pytest.mark.parametrize("place", ["--config-dir", "hydra.searchpath"])
-def test_nothing_undoes_what_a_variants_experiment_sets_by_another_one(tmp_path: Path, place: str):
-    folder = tmp_path / "conf/experiment"
-    folder.mkdir(parents=True)
-    for option, text in NESTED.items():
-        (folder / f"{option}.yaml").write_text(f"# @package _global_\n{text}")
-    path, near = tmp_path / "s.yaml", place == "--config-dir"
-    words = [] if near else [f"hydra.searchpath=[file://{folder.parent}]"]
-    for name in NESTED:
-        path.write_text(f"variants: {{a: [], b: [experiment={name}]}}\n")
-        with plugins.search_folder(folder.parent if near else None):
-            for own in ("memory=lstm", "model.width=16"):
-                said = f"experiment={name} sets {own.partition('=')[0]}, and {own} would override it"
-                with pytest.raises(InputError, match=said):
-                    find_sweep(str(path), [*words, own])
-            assert find_sweep(str(path), [*words, "optim.lr=0.1"])
-        assert find_sweep(str(path), ["memory=lstm"])  # where it is not there, composing says so
-
 
 NO_MEMORY = "variants: {a: [], b: [experiment=no_memory]}"
 REPLACED = "experiment=no_memory would replace experiment=paper; use experiment=[paper,no_memory]"

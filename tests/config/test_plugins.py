@@ -9,7 +9,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import torch
 import yaml
 from own_package import EXAMPLE, PACKAGE, registers_kept
 
@@ -137,27 +136,6 @@ def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
         parse_search({"storage": None, **content, "objectives": ["FootSkate"]})
     plugins.HIGHER.clear()
     assert parse_search({"storage": None, **content, "objectives": ["FootSkate"]}).objectives
-
-
-def test_a_metric_is_measured_in_both_branches(on_path: Path):
-    from tiny import frames, model
-
-    from memmlp.evaluation.ik import NoIK
-    from memmlp.evaluation.metrics import UserMetric
-    from memmlp.evaluation.modes import Evaluation, measure_stream
-
-    def mean(predicted: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-        return predicted.mean()
-
-    own = {"Mean": UserMetric(mean, "positions"), "Turn": UserMetric(mean, "rotations")}
-    report = Evaluation(["stream"], 4, NoIK(), 0, own).report(model(), frames(), "stream")["mean"]
-    assert {"Mean", "Turn"} <= report["rotation"].keys()
-    assert "Mean" in report["position"]
-    assert "Turn" not in report["position"]
-    assert {"rotation Mean", "position Mean"} <= measure_stream(model(), frames().read_clips(), own).keys()
-    wrong = {"Mean": UserMetric(lambda p, t: p, "positions")}
-    with pytest.raises(InputError, match=r"metric Mean"):
-        Evaluation(["stream"], 4, NoIK(), 0, wrong).report(model(), frames(), "stream")
 
 
 HEAD = """

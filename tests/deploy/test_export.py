@@ -1,33 +1,17 @@
 """The ONNX step: the same numbers on a whole clip, its interface, its latency."""
 
 import json
-import logging
 
 import onnx
 import pytest
 import tiny
-import torch
 
-from memmlp.deploy.export import export_module
 from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.motion.body import JOINTS
 
 pytestmark = pytest.mark.slow
 
 CLIP = tiny.clip(50)
-
-
-def test_an_export_says_nothing_of_its_own_passes(tmp_path, caplog):
-    class SameTwice(torch.nn.Module):
-        """Two outputs are one constant, which the exporter's passes complain of."""
-
-        def forward(self, x):
-            return x, torch.ones(1, 40), torch.ones(1, 40)
-
-    export_module(
-        SameTwice(), (torch.zeros(1),), ["x"], ["y", "ones.next", "again.next"], tmp_path / "step.onnx", {}
-    )
-    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
 def test_numbers_interface_and_metadata(naive_step):

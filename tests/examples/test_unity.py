@@ -13,16 +13,13 @@ from typing import IO
 import numpy as np
 import pytest
 import wearer
-from examples.conftest import EXAMPLES, PERSON, Played, trackers
+from examples.conftest import EXAMPLES, Played, trackers
 from processes import started
-from scipy.spatial.transform import Rotation
 
-from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import open_session
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
-from memmlp.live.tracker_resampling import GAP
 from memmlp.motion.body import PARENTS, make_builtin_rest_joints
 
 pytestmark = pytest.mark.slow
@@ -135,16 +132,6 @@ def test_bones_are_where_the_stream_has_the_joints(
     np.testing.assert_allclose(play.turned, turns, atol=1e-4)
 
 
-def test_other_rates_gaps_and_samples_that_come_together(play: Player, stream: Stream):
-    """At 90 Hz some samples bring no frame, at 37 some bring two; the stream restarts after a gap."""
-    fast, slow = rows(trackers("unity")[:40], 90), rows(trackers("unity")[:20], 37)
-    samples = fast + [(time + fast[-1][0] + GAP + 0.1, *rest) for time, *rest in slow]
-    together = [(max(time - 4e-4, 0.0) + 9, *rest) for time, *rest in rows(trackers("unity")[:40])]
-    together[9] = (together[10][0] - 2e-5, *together[9][1:])
-    samples += together
-    np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)
-
-
 def test_a_lost_hand_is_held_and_comes_back_slowly(play: Player, stream: Stream):
     frames = trackers("unity").copy()
     frames[20:35, 1] = np.nan
@@ -157,36 +144,3 @@ def test_a_lost_hand_is_held_and_comes_back_slowly(play: Player, stream: Stream)
     assert jump > 0.1
     assert np.linalg.norm(np.diff(hand, axis=0), axis=-1).max() < jump / 4
     np.testing.assert_allclose(hand[35 + 12 :], there[35 + 12 :], atol=1e-5)
-
-
-def test_calibration_is_that_of_the_stream(play: Player, stream: Stream):
-    """Devices have offsets from the joints, and the wearer in T-pose looks to the side."""
-    turn = Rotation.from_euler("y", 50, degrees=True).as_matrix()
-    stance = np.array([0.3, 0.95, -0.2]) + REST[[15, 20, 21]] @ turn.T
-    joints = [(stance, np.tile(turn, (3, 1, 1)))]
-    moving = trackers("unity")
-    joints += [(frame[:, :3], quaternion_to_matrix(frame[:, 3:])) for frame in moving]
-    askew = Rotation.from_euler("xyz", [[10, 5, 0], [70, -20, 30], [60, 20, -40]], degrees=True).as_matrix()
-    away = np.array([[0, 0.02, 0.08], [0.01, 0.03, -0.05], [-0.01, 0.03, -0.05]])
-    frames = [
-        np.concatenate([place + (turned @ away[..., None])[..., 0], matrix_to_quaternion(turned @ askew)], 1)
-        for place, turned in joints
-    ]
-    samples = [
-        (time, frame, "" if index else "calibrate") for index, (time, frame, _) in enumerate(rows(frames))
-    ]
-    bones = play(samples)
-    np.testing.assert_allclose(bones, poses(stream, samples), atol=1e-4)
-    assert len(bones) == len(PERSON.positions) + 1
-
-
-def test_calibration_of_arms_that_hang_is_refused(play: Player, stream: Stream):
-    hanging = np.array([[0, 1.6, 0, 0, 0, 0, 1], [-0.25, 0.8, 0, 0, 0, 0, 1], [0.25, 0.8, 0, 0, 0, 0, 1]])
-    with pytest.raises(InputError, match="from where a T-pose has it"):
-        stream.calibrate(*((device[:3], device[3:]) for device in hanging))
-    samples = [
-        (time, hanging if index == 0 else frame, "")
-        for index, (time, frame, _) in enumerate(rows(trackers("unity")))
-    ]
-    refused = [(*samples[0][:2], "refuse"), *samples[1:]]
-    np.testing.assert_allclose(play(refused), play(samples), atol=1e-4)

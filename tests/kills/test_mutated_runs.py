@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import io
-import random
-import re
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from begun_runs import complete
 from conftest import Memmlp
 from fake_logger import FakeLogger
-from mutated_runs import STAGES, make_mutants, make_run, mutate_archive
+from mutated_runs import STAGES, make_mutants, make_run
 from rich.console import Console
 
-from memmlp.common.errors import InputError
 from memmlp.report.tables.build_table import (
     find_finished_runs,
     make_run_finder,
@@ -29,14 +23,13 @@ from memmlp.report.tables.build_table import (
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.table_text import to_json
 from memmlp.report.ui.server import Answers
-from memmlp.runs.archive import export_run, import_run
 from memmlp.runs.loggers.logger import sync_runs
 from memmlp.runs.lookup import list_runs
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import render
 from memmlp.sweep.sweep_file import parse_sweep
 
-MAX_SECONDS, MAX_BYTES = 5.0, 300e6
+MAX_SECONDS = 5.0
 COUNTS = [40, pytest.param(500, marks=pytest.mark.long)]
 
 
@@ -95,37 +88,3 @@ def test_damaged_runs_hide_no_other(memmlp: Memmlp, tmp_path: Path, count: int):
         sync_runs(logger, list_runs(tmp_path / "outputs"), warnings.append)
     assert good.id in logger.server.fingerprints
     assert all(sum(run_id in line for line in warnings) == 1 for run_id in bad)
-
-
-@pytest.mark.slow
-def test_a_list_of_damaged_runs_takes_little_memory(tmp_path: Path):
-    make_mutants(tmp_path, 100, seed=1)
-    code = (
-        f"from memmlp.cli.main import main; main(['runs', 'list', '--all', '--outputs', {str(tmp_path)!r}])"
-    )
-    measure = "; print(open('/proc/self/status').read())"
-    ran = subprocess.run([sys.executable, "-c", code + measure], capture_output=True, text=True, check=True)
-    peak = re.search(r"^VmHWM:\s+(\d+) kB", ran.stdout, re.MULTILINE)
-    assert peak
-    assert float(peak[1]) * 1024 < MAX_BYTES
-
-
-@pytest.mark.parametrize("count", COUNTS)
-def test_a_mutated_archive_is_one_line_and_leaves_nothing(tmp_path: Path, count: int):
-    run, dice = complete(tmp_path / "here"), random.Random(0)
-    export_run(run, tmp_path / "run.zip")
-    refused = 0
-    with timed("runs import"):
-        for number in range(count):
-            there = tmp_path / "there" / str(number)
-            mutate_archive(tmp_path / "run.zip", tmp_path / "mutant.zip", dice)
-            imported, error = None, ""
-            try:
-                imported, _ = import_run(tmp_path / "mutant.zip", there)
-            except InputError as raised:
-                error = str(raised)
-            assert imported or error.startswith(f"{tmp_path / 'mutant.zip'}: "), number
-            assert imported or not list(there.rglob("*/*")), number
-            assert not imported or (imported.damage, imported.verify()) == ([], []), number
-            refused += imported is None
-    assert refused > count / 2

@@ -238,16 +238,3 @@ def test_bad_files_are_rejected_at_once_and_nothing_is_written_without_a_frame(t
     lines: list[str] = []
     Recorder([tmp_path / "new" / "a.bvh"], REST, 60.0, lines.append).close()
     assert (list((tmp_path / "new").iterdir()), len(lines)) == ([], 1)
-
-
-def test_the_other_files_are_written_if_one_cannot_be(tmp_path: Path):
-    lines: list[str] = []
-    recorder = Recorder([tmp_path / n for n in ("a.npz", "b/a.bvh", "a.glb")], REST, 60.0, lines.append)
-    recorder.take(frame(0.0))
-    recorder.take(frame(1 / 60))
-    (tmp_path / "b").rmdir()
-    (tmp_path / "b").write_text("a file where a folder is needed")
-    with pytest.raises(InputError, match=r"a\.bvh: cannot be written"):
-        recorder.close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.glb", "a.npz", "b"]
-    assert len(lines) == 2

@@ -174,30 +174,6 @@ def test_lost_trackers_are_held_and_come_back(trackers, during, speed, file, und
     assert wearer.fastest(joints[129:160]) < speed
 
 
-@pytest.mark.parametrize("gone", [
-    None, ([np.nan, 0, 0], np.eye(3)), ([0, 0, 0], np.full((3, 3), np.nan)),
-    ([0, 0, 0], [np.nan, 0, 0, 1]),
-    ([0, 0, 0], [0, 0, 0, 0]), ([np.inf, 0, 0], np.eye(3)), ([0, 0, -1e38], np.eye(3)),
-])  # fmt: skip
-def test_what_counts_as_lost(file, gone):
-    stream = Stream(file)
-    head, _, right = zip(PERSON.positions[5], PERSON.rotations[5], strict=True)
-    wearer.play(stream, PERSON.positions[:5], PERSON.rotations[:5])
-    pose = stream.step(head, gone, right)
-    assert pose.held == ("left",)
-    assert np.isfinite(pose.positions).all()
-
-
-def test_trackers_that_were_never_there(file):
-    """They stand in a T-pose, finite, until they are seen."""
-    for seen in ((), (0,), (1, 2)):
-        lost = {index: [k for k in range(3) if k not in seen] for index in range(20)}
-        poses = wearer.play(Stream(file), PERSON.positions[:60], PERSON.rotations[:60], lost=lost)
-        assert all(len(pose.held) == 3 - len(seen) for pose in poses[:20])
-        assert np.isfinite(wearer.joints(poses)).all()
-        assert not poses[-1].held
-
-
 @pytest.mark.parametrize("name", SPACES)
 def test_calibration_finds_how_the_devices_sit(name, file):
     """It does so in any heading; positions up to the devices' mean distance, which a T-pose can't tell."""

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from memmlp.motion import clip as module
 from memmlp.motion.clip import INTERPOLATIONS, Clip, resample
 
 
@@ -88,11 +87,3 @@ def test_pieces_are_the_clip():
         assert [len(piece) for piece in pieces] == lengths
         np.testing.assert_array_equal(np.concatenate([piece.poses for piece in pieces]), poses)
         np.testing.assert_array_equal(np.concatenate([piece.trans for piece in pieces]), trans)
-
-
-def test_rates_of_cameras_and_of_video_are_known_and_those_of_cut_off_frame_times_are_not():
-    rates = [*module.USUAL_RATES, *module.RARE_RATES, 23.976, 29.97, 59.94, 119.88, 1 / 0.0083333]
-    assert all(map(module.is_known_rate, rates))
-    for time, usual in ((0.016, 60), (0.008, 120), (0.03, 30)):
-        assert not module.is_known_rate(1 / time)
-        assert module.find_nearest_rate(1 / time) == usual

@@ -82,16 +82,6 @@ def test_a_clip_keeps_its_rate_or_gets_another_and_is_exported_on_its_import_s_b
     export(plan_export(folder / "walk.npz", tmp_path / "walk.glb"))
 
 
-def test_what_is_unusual_is_exported_and_said(folder: Path, memmlp: Memmlp):
-    """Somebody who lies throughout, or a file with another axis up."""
-    still = Clip("lying", np.zeros((5, 22, 3)) + 1e-3 * np.arange(5)[:, None, None], np.zeros((5, 3)), 60.0)
-    write_clip(folder / "lying.npz", still)
-    report = export(plan_export(folder / "lying.npz", folder.parent / "lying.bvh"))
-    assert report.unusual["lying"].startswith("the head is never above the pelvis")
-    ran = memmlp("data", "export", str(folder / "lying.npz"), "--out", "again.bvh")
-    assert ran.out.startswith("unusual: lying: the head is never above the pelvis")
-
-
 def test_unclear_or_dangerous_targets_are_refused(folder: Path):
     (folder.parent / "file").write_text("")
     (folder / "empty").mkdir()
@@ -101,14 +91,10 @@ def test_unclear_or_dangerous_targets_are_refused(folder: Path):
     for source, out, name, *words in (
         ("none.npz", "a.bvh", None, "none.npz", "no such file or folder"),
         ("walk.npz", "a.fbx", None, "--out", "a.fbx", ".bvh, .npz, .glb"),
-        ("walk.npz", "a", "bvh", "--out", "suffix"),
         ("walk.npz", "a.glb", "bvh", "--out", "--format bvh"),
-        ("walk.npz", "dance", "bvh", "--out", "not a folder"),
         ("walk.npz", "walk.npz", None, "--out", "source"),
         (".", "../a", None, "--format", "bvh, npz, gltf"),
-        (".", "../a.bvh", "bvh", "--out", "must be a folder"),
         (".", "below", "npz", "--out", "a separate folder"),
-        ("dance", ".", "npz", "--out", "a separate folder"),
         ("empty", "../a", "npz", "no npz"),
     ):
         with pytest.raises(InputError) as error:

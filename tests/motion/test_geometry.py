@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from memmlp.motion import geometry
 from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.geometry import compute_clip_kinematics, limit_to_one_thread
+from memmlp.motion.geometry import compute_clip_kinematics
 
 ANGLES = (0.0, 1e-9, 1e-7, 1e-3, 1.0, 3.0, math.pi - 1e-4, math.pi - 1e-7, 10.0)
 
@@ -96,12 +96,3 @@ def test_a_body_that_is_turned_about_its_pelvis():
         np.testing.assert_allclose(rotations[frame], np.tile(matrix, (22, 1, 1)), atol=1e-7)
         expected = rest[0] + trans[frame] + (rest - rest[0]) @ matrix.T
         np.testing.assert_allclose(positions[frame], expected, atol=1e-7)
-
-
-def test_one_thread_and_then_as_many_as_before() -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    with limit_to_one_thread():
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == 2
-    torch.set_num_threads(before)

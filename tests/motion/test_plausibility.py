@@ -124,15 +124,6 @@ def test_a_translation_that_does_not_fit_the_steps_is_reported(trans, z):
     assert faults(wrong).startswith(f"the lowest joint is at z = {z} m, and no joint stands still")
 
 
-def test_a_glitch_or_a_wound_up_root_passes():
-    clip = motion("walking")
-    trans, poses = clip.trans.copy(), clip.poses.copy()
-    trans[10:12] += 50.0
-    norms = np.linalg.norm(poses[:, 0], axis=-1, keepdims=True)
-    poses[:, 0] *= (norms + 2 * np.pi) / norms
-    assert explain_implausibility(replace(clip, trans=trans, poses=poses)) is None
-
-
 def test_people_in_other_units_or_with_another_axis_are_refused():
     clip = motion("walking")
     assert "degrees" in explain_implausibility(replace(clip, poses=np.degrees(clip.poses)))
@@ -142,19 +133,6 @@ def test_people_in_other_units_or_with_another_axis_are_refused():
     clip = motion("idling")
     still = replace(clip, trans=clip.trans[0] + 0.05 * (clip.trans - clip.trans[0]))
     assert "at z = " in explain_implausibility(replace(still, trans=100 * still.trans))
-
-
-def test_who_lies_long_and_then_stands_passes():
-    """Lying alone would look like standing along Y here: the feet are at y = 0."""
-    clip = motion("idling")
-    long = lying(clip)
-    long = moved(long, y=0.95 - np.median(long.trans[:, 1]))
-    assert "Y is up" in explain_implausibility(long)
-    cut = len(clip) * 7 // 10
-    poses, trans = (
-        np.concatenate([getattr(long, part)[:cut], getattr(clip, part)[cut:]]) for part in ("poses", "trans")
-    )
-    assert explain_implausibility(replace(clip, poses=poses, trans=trans)) is None
 
 
 SALSA = Path(__file__).parents[3] / "shared" / "data" / "cmu" / "salsa" / "05.bvh"

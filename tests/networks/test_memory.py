@@ -74,19 +74,6 @@ def test_memories_train_in_bfloat16(kind, tmp_path):
     assert all(torch.isfinite(p).all() for p in task.model.parameters())
 
 
-@pytest.mark.parametrize("training", [True, False])
-@pytest.mark.parametrize("kind", [CodeMemory, JointCodeMemory])
-@torch.no_grad()
-def test_a_memory_recalls_the_same_codes_in_a_mixed_precision_training(kind, training):
-    memory, state = tiny.model(kind).memory.train(training), {"motion": 3 * torch.randn(200, 13, 198)}
-    sparse = 3 * torch.randn(200, 20, SPARSE_DIM)
-    latent = memory.codes.encoder(torch.cat([sparse[:, :7], state["motion"][:, :7]], -1))
-    memory.codes.codebook.vectors.copy_(latent[:8, 0])
-    with torch.autocast("cpu", torch.bfloat16):
-        found = memory.recall(sparse, state, 7)
-    torch.testing.assert_close(found, memory.recall(sparse, state, 7), rtol=0, atol=0)
-
-
 def joint_task(codebook: str = "ema") -> MotionTask:
     vqvae = partial(VQVAE, codes=8, width=12, encoder_depth=2, codebook=codebook)
     task = motion_task("forced", Optim(steps=3, batch=5, lr=1e-2), kind=JointCodeMemory, vqvae=vqvae)

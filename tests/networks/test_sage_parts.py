@@ -23,19 +23,6 @@ def test_published_sizes():
 
 
 @torch.no_grad()
-def test_the_shapes_of_a_window_on_its_way_through_the_parts():
-    x, rotation, time = torch.randn(2, 20, 54), torch.randn(2, 20, 132), torch.tensor([3, 5])
-    codes = [sage_parts.HalfVQVAE(half, SMALL).eval() for half in (sage_parts.UPPER, sage_parts.LOWER)]
-    latents = [one.encode(rotation, x)[0] for one in codes]
-    decoded = [one.decode(z) for one, z in zip(codes, latents, strict=True)]
-    assert [tuple(one.shape) for one in decoded] == [(2, 20, 84), (2, 20, 54)]
-    assert sage_parts.UpperDenoiser(SMALL)(latents[0], time, x).shape == (2, 10, 384)
-    denoiser = sage_parts.LowerDenoiser(SMALL)
-    assert denoiser(denoiser.merge_latents(latents[1], latents[0]), time, x).shape == (2, 10, 384)
-    assert sage_parts.Decoder(SMALL)(*latents, x).shape == (2, 20, 132)
-
-
-@torch.no_grad()
 def test_the_nearest_code_of_each_book_stands_for_its_part():
     quantiser, z = sage_parts.ProductQuantiser().eval(), torch.randn(2, 5, 384)
     found, loss = quantiser(z)

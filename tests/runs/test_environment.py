@@ -34,22 +34,6 @@ def test_code_that_is_edited_while_it_runs_is_recorded_as_it_runs(tmp_path: Path
     assert describe_user_packages(["lab_of_mine"]) == before
 
 
-def test_a_file_is_parsed_only_if_its_bytes_differ(monkeypatch: pytest.MonkeyPatch):
-    files = {name: b"A = 1" for name in ("same.py", "comment.py", "changed.py", "mixed.py")}
-    monkeypatch.setattr(module, "read_code_files", lambda packages: files)
-    manifest = module.describe_sources()
-    manifest["sources"] |= {"mixed.py": module.MIXED, "gone.py": "0" * 12}
-    files |= {"comment.py": b"A = 1  # one", "changed.py": b"A = 2", "new.py": b"B = 1"}
-    parsed: list[bytes] = []
-    digest = module.compute_code_digest
-    monkeypatch.setattr(module, "compute_code_digest", lambda code: parsed.append(code) or digest(code))
-    assert module.list_changed_files(manifest) == ["changed.py", "mixed.py"]
-    assert sorted(parsed) == [b"A = 1", b"A = 1  # one", b"A = 2"]  # of mixed.py, comment.py and changed.py
-    older = {"sources": manifest["sources"]}
-    assert module.list_changed_files(older) == ["changed.py", "mixed.py"]
-    assert module.list_changed_files({}) == []
-
-
 def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "first"]):
         (tmp_path / "__init__.py").write_text("A = 1\n")

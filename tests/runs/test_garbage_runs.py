@@ -7,7 +7,6 @@ import pytest
 from memmlp.common.files import write_json
 from memmlp.common.lease import current_process
 from memmlp.runs.garbage_runs import delete, find_garbage
-from memmlp.runs.identity import VERSIONS
 from memmlp.runs.lookup import add_tags, remove_tags
 from memmlp.runs.run import Run
 
@@ -69,7 +68,6 @@ def test_deleted_is_the_folder_and_no_other_unless_it_was_marked_meanwhile(outpu
 
 
 @pytest.mark.parametrize(("file", "content"), [
-    ("plan.json", "{"),
     ("plan.json", '{"entries": [], "tasks": []}'),  # its data is not there
     ("plan.json", '{"entries": [{"label": "a", "seed": 1, "id": "0"}]}'),  # for another seed
     ("entries.json", "{"),
@@ -101,14 +99,3 @@ def test_a_finished_vqvae_of_a_search_under_way_stays(outputs: Path):
     assert CODES in found(outputs)
     write_json(folder / "one.process", current_process())
     assert CODES not in found(outputs)
-
-
-def test_a_network_upon_an_older_vqvae_may_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its own component versions do not include those of its prerequisite runs."""
-    run = Run.from_id(tmp_path, OLD)
-    above = [{"id": CODES, "component_versions": {"codebook.ema": VERSIONS["codebook.ema"]}}]
-    versions = {"component_versions": {"memory.vq": 1}, "prerequisite_runs": above}
-    run.begin("memmlp", {}, data="d", prerequisite=None, **versions)
-    assert found(tmp_path, "old") == {}
-    monkeypatch.setitem(VERSIONS, "codebook.ema", VERSIONS["codebook.ema"] + 1)
-    assert found(tmp_path, "old") == {OLD: "old"}

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 from begun_runs import CONFIG, begun
-from fake_runs import fake_run
 
 from memmlp.common.errors import InputError
 from memmlp.runs import lookup
@@ -38,13 +37,6 @@ def test_a_bare_folder_name_is_found_and_an_ambiguous_beginning_lists_the_runs(t
         lookup.find_run(tmp_path, "ab")
     monkeypatch.chdir(runs[0].folder.parent)
     assert lookup.find_run("outputs", runs[0].id).folder == runs[0].folder.resolve()
-
-
-def test_a_refiner_saw_its_network_s_frames_and_its_own_pieces(tmp_path: Path):
-    seen = {"optim": {"steps": 100, "batch": 8}, "model": {"frames": 11}}
-    above = {"prerequisite": fake_run(tmp_path, "network", config=seen).id}
-    refiner = fake_run(tmp_path, "refiner", config=seen | {"refiner": {"frames": 20}}, origin=above)
-    assert lookup.count_training_frames(refiner) == 100 * 8 * (11 + 20)
 
 
 def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):

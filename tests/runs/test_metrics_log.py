@@ -1,12 +1,8 @@
 """The log of metrics survives kills and says what is broken."""
 
-import errno
 import json
 import math
-import os
 from pathlib import Path
-from typing import Any
-from unittest.mock import MagicMock, Mock
 
 import pytest
 from begun_runs import begun, complete
@@ -82,22 +78,3 @@ def test_a_line_that_is_written_late_goes_to_the_old_file(tmp_path: Path):
         (run.folder / "now").touch()
         run.log(3, {"loss": 3.0})
     assert [entry.values for entry in run.metrics()] == [{"loss": 0.5}, {"loss": 2.0}]
-
-
-def test_a_line_that_is_half_written_is_an_error_and_then_gone(tmp_path: Path, monkeypatch):
-    run, real = complete(tmp_path), open
-    run.log(1, {"loss": 1.0})
-
-    def open_full(path: Path, mode: str, **options: Any) -> Mock:
-        file = real(path, mode, **options)
-        full = MagicMock(**{"write.side_effect": lambda line: file.write(line[:9])})
-        full.__enter__.return_value = full
-        full.__exit__.side_effect = lambda *_: file.close()
-        return full
-
-    with monkeypatch.context() as full:
-        full.setattr("builtins.open", open_full)
-        with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
-            run.log(2, {"loss": 2.0})
-    run.log(3, {"loss": 3.0})
-    assert [entry.step for entry in run.metrics()] == [1, 3]

@@ -7,13 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from begun_runs import CONFIG, begun, complete
+from begun_runs import complete
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json, write_json
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.runs.garbage_runs import find_garbage
-from memmlp.runs.lookup import count_training_frames
 from memmlp.runs.run import Run
 
 
@@ -62,14 +61,6 @@ def test_a_damaged_run_is_no_garbage(tmp_path: Path):
     run = complete(tmp_path)
     run.manifest_path.write_text("{")
     assert find_garbage(tmp_path) == []
-
-
-def test_runs_that_refine_each_other_have_no_known_training(tmp_path: Path):
-    config = CONFIG | {"optim": {"steps": 5, "batch": 2}, "refiner": {"name": "r", "frames": 7}}
-    first, second = (begun(tmp_path, config | {"seed": seed}) for seed in (0, 1))
-    first.write_manifest({"prerequisite": second.id})
-    second.write_manifest({"prerequisite": first.id})
-    assert count_training_frames(first) == 0
 
 
 def test_a_claim_of_anybody_does_not_break_the_status(tmp_path: Path):

@@ -13,7 +13,6 @@ from memmlp.common.files import write_json
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.ui.run_index import read_facts
 from memmlp.runs import identity
-from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import is_intact, write_report
 from memmlp.runs.query import build_record
 from memmlp.runs.run import Run
@@ -148,16 +147,6 @@ def test_verify_names_what_changed(tmp_path: Path):
     assert run.verify() == [*names[:2], "deployments/fp32-0/step.onnx", "evaluations/stream-0.json"]
 
 
-def test_cleared_stages_leave_no_file_of_any_precision(tmp_path: Path):
-    """A file that stays would keep its folder, and seem to be of the next weights."""
-    run = complete(tmp_path)
-    for precision in ONNX_FILES:
-        run.deployment("int8-0").onnx_path(precision).touch()
-    run.clear_stages()
-    assert not run.deployments.exists()
-    assert not run.evaluations.exists()
-
-
 def test_a_reset_removes_the_runs_files_and_no_others_results_first(tmp_path: Path, monkeypatch):
     """At any moment, what is removed first is what was made from the rest."""
     run = begun(tmp_path)
@@ -191,14 +180,6 @@ def test_a_resumed_run_keeps_its_start(tmp_path: Path):
     assert run.manifest["started"].startswith("2020")
     assert run.manifest["finished"] is None
     assert run.config == CONFIG
-
-
-@pytest.mark.parametrize("text", ["a: [b", "5", "[]"])
-def test_a_damaged_config_is_named(tmp_path: Path, text: str):
-    run = begun(tmp_path)
-    run.config_path.write_text(text)
-    with pytest.raises(InputError, match=r"config\.yaml: cannot be read"):
-        _ = run.config
 
 
 def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):

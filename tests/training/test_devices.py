@@ -5,7 +5,7 @@ import torch
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
-from memmlp.training.devices import choose_device, describe_missing_gpu, describe_unused_gpu
+from memmlp.training.devices import choose_device, describe_missing_gpu
 
 
 @pytest.fixture
@@ -54,17 +54,3 @@ def test_without_gpus(gpus, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     assert "torch" in str(describe_missing_gpu())
     assert "CUDA_VISIBLE_DEVICES is '3'" in str(describe_missing_gpu())
-
-
-def test_a_gpu_that_torch_cannot_use_is_told(gpus, monkeypatch, tmp_path):
-    for name, visible, count, driver, said in (
-        ("auto", None, 0, True, True), ("auto", "0", 0, True, True), ("cpu", None, 0, True, False),
-        ("auto", None, 1, True, False), ("auto", None, 0, False, False),  # torch uses it, where one exists
-        ("auto", "", 0, True, False), ("auto", "-1", 0, True, False),  # hidden on purpose
-    ):  # fmt: skip
-        gpus(count)
-        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-        if visible is not None:
-            monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-        monkeypatch.setattr("memmlp.training.devices.NVIDIA_DRIVER", tmp_path / ("." if driver else "none"))
-        assert ("device=cpu" in (describe_unused_gpu(name) or "")) == said

@@ -20,7 +20,7 @@ from own_package import registers_kept
 from PIL import Image
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.common.files import file_digest, find_packaged_folder
+from memmlp.common.files import file_digest
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import compose_config
 from memmlp.motion.dataset import MotionDataset
@@ -33,8 +33,7 @@ from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled
 from memmlp.training import run_stages
-from memmlp.training.run_stages import make_prerequisites, record_outcome
-from memmlp.training.train_network import TrainingJob
+from memmlp.training.run_stages import record_outcome
 
 
 def motion_run(folder: Path) -> Run:
@@ -159,31 +158,6 @@ def test_changed_weights_are_not_evaluated_and_what_is_exported_is_checked_on_th
     weights[-1] ^= 1
     copy.model.write_bytes(weights)
     assert "changed since the training" in command(home, "eval", str(copy.folder), "--again", code=2)
-
-
-EXPERIMENTS = sorted(path.stem for path in find_packaged_folder("conf/experiment").glob("*.yaml"))
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["paper", *(pytest.param(name, marks=pytest.mark.long) for name in EXPERIMENTS if name != "paper")],
-)
-def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.MonkeyPatch):
-    """Two steps and one validation of each, on the prepared data, without export."""
-    monkeypatch.chdir(home)
-    cfg = compose_config([f"experiment={name}", *TINY, "optim.steps=2"])
-    experiment = build_experiment(cfg)
-    data = experiment.motion.prepare()
-    above = make_prerequisites(experiment, data)
-    run = Run(home / "variants" / name)
-    run.folder.mkdir(parents=True, exist_ok=True)
-    weights = above.model if above else None
-    experiment.training.train(TrainingJob(experiment.architecture, data, weights, run, experiment.device))
-    model = experiment.architecture.load(run.model)
-    values = run.metrics()[-1].values
-    assert all(np.isfinite(value) for value in values.values())
-    assert len(data.open("test").names) > 0
-    assert torch.isfinite(model.stem.weight).all()
 
 
 @pytest.mark.parametrize(("error", "failure"), [

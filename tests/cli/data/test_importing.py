@@ -14,7 +14,7 @@ from skeleton_families import walking
 
 from memmlp.cli.data import data
 from memmlp.common.errors import InputError
-from memmlp.motion.importing.skeleton_map import SKELETONS, load_skeleton
+from memmlp.motion.importing.skeleton_map import load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
 
@@ -61,14 +61,6 @@ def test_import_warns_of_the_same_faults(source: Path) -> None:
     assert "2 clips, 1.0 seconds, skeleton cmu_daz" in output
     next_command = output.partition("next: ")[2].splitlines()[0]
     assert shlex.split(next_command)[:4] == ["memmlp", "train", "data=mocap", "data.root='a folder'"]
-
-
-def test_a_wrong_unit_is_reported_by_both(source: Path) -> None:
-    text = (SKELETONS / "cmu_daz.yaml").read_text().replace("unit: 0.01 ", "unit: 0.0039 ")
-    path = str(write(source.parent, text, "mine.yaml"))
-    for command, code in ((["verify"], 1), (["import", "--out", "out"], 0)):
-        words = ["data", command[0], "source/a.bvh", *command[1:], "--skeleton", path]
-        assert "a.bvh: the legs are 0.32 m long" in run(source.parent, *words, code=code)
 
 
 @pytest.mark.parametrize(("options", "key"), [

@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 from memmlp.live.session.loop import convert_to_millimetres, make_avatar_message, make_greeting
 from memmlp.live.session.server import Hub, LiveServer, load_page_files, make_mannequin_vrm
-from memmlp.live.session.sources import ClipSource, TrackedClip
+from memmlp.live.session.sources import ClipSource
 from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.formats.gltf import VRM_BONES as VRM
@@ -120,30 +120,3 @@ def test_an_avatar_s_bones_are_where_the_joints_are(browser, own: bytes, clip, e
         assert along == pytest.approx(joints[joint] - joints[above], abs=3e-3), VRM[joint]
     if edit is not without_chest:
         assert np.linalg.norm(np.array(found) - joints, axis=1).max() < 2e-3
-
-
-@pytest.mark.slow
-def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: bytes, clip: TrackedClip):
-    """Also on a page that was loaded after the wearer's height was changed there."""
-    files = load_page_files(own)
-    hub = Hub(make_greeting(ClipSource(clip, 60), "tiny", avatar=True))
-    with LiveServer(hub, 0, files=files) as server:
-        browser.open(server.url)
-        browser.wait("document.documentElement.dataset.avatar == 'loaded'")
-        browser.resolved("""import('./avatar.js').then(({ Avatar }) => {
-          const { pose } = Avatar.prototype;
-          Avatar.prototype.pose = function (...words) {
-            pose.apply(this, words);
-            window.size = this.scene.scale.x;
-          };
-        })""")
-        for number, size in enumerate((1.2, 0.9)):
-            person = pose(size)
-            told = make_avatar_message(person) | {
-                "positions": convert_to_millimetres(person.positions),
-                "truth": None,
-            }
-            times = {"number": number, "time": 0.0, "held": [], "jumping": False, "ms": 1.0, "whole": 1.0}
-            server.hub.publish(told | times | {"dropped": 0, "malformed": 0})
-            browser.wait(f"Math.abs(window.size - {size}) < 1e-3")
-    assert browser.errors == []

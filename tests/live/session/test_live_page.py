@@ -113,30 +113,6 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser, clip,
     browser.wait("document.querySelector('#status').textContent == 'not connected'")
 
 
-def frame(number: int) -> dict[str, object]:
-    counts = {"held": [], "jumping": False, "dropped": 0, "malformed": 0}
-    positions = {"positions": np.random.default_rng(0).integers(0, 1500, 66).tolist(), "truth": None}
-    return {"number": number, "time": 0.0, "ms": 1.0, "whole": 1.0, **positions, **counts}
-
-
-def test_another_command_at_the_address_gets_a_page_of_its_own(browser: Browser, clip: TrackedClip):
-    """Nothing of the network before is left: not its frames, which would be told as the new one's."""
-    browser.size(240, 200)  # nothing is clicked
-    # Both looked for while the next page loads, too.
-    source, about = ClipSource(clip, 60), "document.querySelector('#about')?.textContent"
-    with LiveServer(Hub(make_greeting(source, "tiny")), 0) as server:
-        port = server.server_port
-        browser.open(server.url)
-        browser.wait(f"{about} == 'tiny · person at 60 Hz'")
-        server.hub.publish(frame(5))
-        browser.wait(f"{SHOWN} == 5")
-    with LiveServer(Hub(make_greeting(source, "other")), port) as server:
-        browser.wait(f"{about} == 'other · person at 60 Hz'")
-        server.hub.publish(frame(100))
-        browser.wait(f"{SHOWN} == 100 && {NEWEST} == 100")
-        assert browser.value("document.querySelector('#scrub').min") == "100"
-
-
 class Worn(ClipSource):
     """A clip that counts as somebody's devices."""
 
@@ -174,17 +150,3 @@ def test_the_wearer_fits_the_stream_from_the_page(browser, network: Path, clip: 
         whole = "parseFloat(document.querySelector('#whole').textContent)"
         assert browser.wait(whole) > 0
     assert browser.errors == []
-
-
-def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: TrackedClip):
-    """Scripts, frames and orders go by the cookie, and the token stands in the address no more."""
-    asked: list[object] = []
-    hub = Hub(make_greeting(Worn(clip, 60), "tiny"))
-    with LiveServer(hub, 0, "0.0.0.0", take_command=asked.append) as server:
-        address = f"http://127.0.0.1:{server.server_port}/"
-        browser.call("Page.navigate", url=f"{address}?{server.url.partition('?')[2]}")
-        browser.wait(f"location.href == '{address}' && document.readyState == 'complete'")
-        browser.wait("document.querySelector('#about').textContent == 'tiny · person at 60 Hz'")
-        browser.click("#calibrate")
-        until(lambda: asked, "an order")
-    assert (asked, browser.errors) == ([{"action": "calibrate", "value": None}], [])

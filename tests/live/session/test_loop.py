@@ -14,7 +14,6 @@ from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.session.loop import COUNTDOWN, Fitting, run_loop
 from memmlp.live.session.sources import ClipSource, SourceSample, TrackedClip
 from memmlp.live.stream import Stream
-from memmlp.live.tracker_input import JUMPS
 from memmlp.live.tracker_resampling import make_t_pose
 from memmlp.live.wearer import read_calibration
 
@@ -206,18 +205,3 @@ def test_held_trackers_and_malformed_samples_are_counted(network: Path, clip: Tr
     assert [m["number"] for m in messages if m["held"]] == list(range(39, 49))
     assert messages[45]["held"] == ("left",)
     assert (messages[50]["malformed"], messages[-1]["malformed"]) == (0, 1)
-
-
-class InMilliseconds(Instant):
-    """A clip whose sender takes milliseconds for seconds."""
-
-    def read(self) -> SourceSample | None:
-        sample = super().read()
-        return sample._replace(time=1000 * sample.time)
-
-
-def test_times_in_milliseconds_are_reported_once(network: Path, clip: TrackedClip):
-    messages, said = played(network, clip, 60, InMilliseconds)
-    assert len(said) == 1
-    assert said[0].endswith("check that `time` is in seconds")
-    assert [message["jumping"] for message in messages] == [n >= JUMPS for n in range(len(messages))]

@@ -3,7 +3,6 @@
 import http.client
 import json
 import struct
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import Mock
@@ -89,11 +88,6 @@ def test_the_pages_files_are_served_and_nothing_else(server: LiveServer):
     assert get(server, "/events", Host=f"elsewhere.example:{server.server_port}").status == 403
 
 
-def test_a_taken_port_is_one_line(server: LiveServer):
-    with pytest.raises(InputError, match=f"--port {server.server_port}: "):
-        LiveServer(Hub({}), server.server_port)
-
-
 def post(server: LiveServer, content: bytes, path: str = "/wearer", **headers: str) -> tuple[int, str]:
     response = request(server, "POST", path, content, **headers)
     return response.status, response.read().decode()
@@ -113,31 +107,6 @@ def test_commands_of_the_page_arrive():
         for name, value in {**elsewhere, "Sec_Fetch_Site": "cross-site"}.items():
             assert post(server, b"{}", **{name: value})[0] == 403, name
     assert ask.call_count == 2
-
-
-def test_at_another_address_everything_needs_the_token(clip: TrackedClip):
-    token = "a token of many letters"
-    with LiveServer(Hub({}), 0, "0.0.0.0", token, take_command=pytest.fail) as server:
-        for path in ("/", "/events", "/main.js", "/?token=wrong", "/events?token="):
-            assert get(server, path).status == 403, path
-        assert post(server, b"{}")[0] == 403
-        entered = get(server, f"/?{server.url.partition('?')[2]}")
-        assert (entered.status, entered.headers["Location"]) == (303, "/")
-        cookie = entered.headers["Set-Cookie"].partition(";")[0]
-        response = get(server, "/events", Cookie=cookie)
-        assert (response.status, next(events(response))[0]) == (200, "greeting")
-        assert "0.0.0.0" not in server.url  # which nobody can open from elsewhere
-
-
-def test_the_end_leaves_the_port_and_no_thread(clip: TrackedClip):
-    before = threading.active_count()
-    with LiveServer(Hub({}), 0) as server:
-        response = get(server, "/events")
-        port = server.server_port
-    assert b"frame" not in response.read()  # it ends
-    with LiveServer(Hub({}), port):
-        pass
-    assert threading.active_count() <= before + 1  # the watcher's own thread may still be ending
 
 
 def vrm(content: object) -> bytes:

@@ -16,7 +16,6 @@ from memmlp.motion.formats.bvh import MAX_JOINTS, TIPS, compute_euler_zxy, read_
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import NONE
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder
-from memmlp.motion.synthetic import synthesize_clip
 
 
 def write(folder: Path, text: str | bytes) -> Path:
@@ -93,30 +92,18 @@ Frame Time: 0.01
 """
 DAMAGE = {
     "no hierarchy": ("HIERARCHY", "HIERACHY", "line 1"),
-    "no brace": ("ROOT hip\n{", "ROOT hip", "line 3"),
-    "brace too many": ("}\n}\n}", "}\n}\n}\n}", "line 16"),
     "no motion": ("MOTION\n", "", "MOTION"),
     "twice a name": ("JOINT knee", "JOINT hip", "line 6"),
-    "name of an end site": ("ROOT hip", "ROOT knee.end", "line 10: name 'knee.end'"),
     "second end site": ("-41 0\n}", "-41 0\n}\nEnd Site\n{\nOFFSET 0 1 0\n}", "line 14: name 'knee.end'"),
-    "second root": ("}\nMOTION", "}\nROOT b\n{\nOFFSET 0 0 0\nCHANNELS 0\n}\nMOTION", "line 16"),
     "no number": ("OFFSET 0 -40 0", "OFFSET 0 forty 0", "'forty'"),
-    "NaN offset": ("OFFSET 0 -40 0", "OFFSET 0 nan 0", "'nan'"),
     "seven channels": ("CHANNELS 1", "CHANNELS 7", "'7'"),
-    "unknown channel": ("CHANNELS 1 Xrotation", "CHANNELS 1 Wrotation", "'Wrotation'"),
     "too few channels": ("CHANNELS 3", "CHANNELS 2", "line 5: 'Yrotation'"),
     "no frames line": ("Frames: 2\n", "", "line 17: 'Frame Time: 0.01'"),
     "no frames": ("Frames: 2", "Frames: 0", "line 17: Frames: '0'"),
-    "frames in words": ("Frames: 2", "Frames: two", "'two'"),
     "wrong count": ("Frames: 2", "Frames: 3", "Frames: 3, but 2"),
-    "zero frame time": ("0.01", "0", "line 18: Frame Time: '0'"),
-    "NaN frame time": ("0.01", "nan", "'nan'"),
     "no frame time": ("Frame Time: 0.01\n", "", "Frame Time:"),
     "value missing": ("5 6 7 8", "5 6 7", "line 20: 3 values"),
     "NaN": ("5 6 7 8", "5 6 NaN 8", "line 20: 'NaN'"),
-    "word": ("5 6 7 8", "5 6 seven 8", "line 20: 'seven'"),
-    "underscore": ("5 6 7 8", "5 6 7_0 8", "line 20: '7_0'"),
-    "no values": ("1 2 3 4\n5 6 7 8\n", "", "Frames: 2, but 0"),
     "no channels": ("3 Zrotation Xrotation Yrotation\n", "0\n", "line 19: 4 values"),
 }
 
@@ -220,15 +207,6 @@ def test_angles_do_not_jump():
     halfway = Rotation.from_euler("ZXY", (angles[1:] + angles[:-1]) / 2, degrees=True)
     expected = Rotation.from_rotvec((turn[1:] + turn[:-1])[:, None] / 2 * axis)
     assert np.degrees((halfway.inv() * expected).magnitude()).max() < 2
-
-
-def test_the_skeleton_is_recognised(tmp_path: Path):
-    """As the joints of SMPL that others write too, so that unit and up axis are found in the file."""
-    clip = synthesize_clip("walking", 1, seconds=1.0)
-    write_bvh(tmp_path / "clip.bvh", clip, REST)
-    report = import_folder(tmp_path / "clip.bvh", tmp_path / "back", ImportSettings(floor=NONE))
-    assert [(each.skeleton, each.faults) for each in report.clips] == [("smpl_words", ())]
-    check_same(clip, read_clip(tmp_path / "back" / "clip.npz", "clip"))
 
 
 def test_names_may_have_blanks(tmp_path: Path):

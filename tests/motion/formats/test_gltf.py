@@ -8,7 +8,7 @@ from glb import Glb
 
 from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats.gltf import UNITY_BONES, build_mannequin, write_gltf, write_vrm
+from memmlp.motion.formats.gltf import UNITY_BONES, write_gltf, write_vrm
 from memmlp.motion.geometry import compute_clip_kinematics
 
 REST = make_builtin_rest_joints()
@@ -77,17 +77,6 @@ def test_the_mannequin_moves_with_the_joints(glb: Glb):
     for frame in (0, 17, len(CLIP) - 1):
         moved = JOINTS_Y_UP[frame][owner]
         np.testing.assert_allclose(np.linalg.norm(glb.vertices(frame) - moved, axis=1), reach, atol=1e-5)
-
-
-def test_the_mannequin_is_seen_from_outside():
-    mesh = build_mannequin(REST)
-    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-12)
-    a, b, c = (mesh.positions[mesh.triangles[:, corner]] for corner in range(3))
-    across = np.cross(b - a, c - a)
-    real = np.linalg.norm(across, axis=1) > 1e-9  # a limb's ends are points
-    assert real.mean() > 0.8
-    assert (across * mesh.normals[mesh.triangles].mean(1)).sum(1)[real].min() > 0
-    assert np.ptp(mesh.positions, axis=0) == pytest.approx([1.66, 1.77, 0.27], abs=0.02)  # a T-pose
 
 
 REQUIRED = {

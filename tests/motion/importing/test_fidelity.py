@@ -1,12 +1,11 @@
 """The comparison of a clip with its file can fail, names what is worst, and knows what people look like."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bvh_samples import TREES, own_tree, performed, person, rest_turns, tree, write
+from bvh_samples import TREES, own_tree, performed, person, tree, write
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import JOINTS, make_builtin_rest_joints
@@ -68,24 +67,13 @@ def test_a_joint_that_is_off_in_one_frame_is_named(walk: Conversion, joint: str,
     assert segment in (None, fidelity.degrees.where)  # spine2 carries several
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    (lambda c: replace(c, fps=1000.0, trans=20 * c.trans), "the pelvis moves at"),
-    (lambda c: bent(c, "head", slice(None), [0.0, np.pi, 0.0]), "the head is rotated by"),
-    (lambda c: replace(c, trans=0 * c.trans), "the lowest joint is at z = -0.9 m"),
-    (lambda c: bent(c, "spine1", slice(None), [2.8, 0.0, 0.0]), "the head is never above the pelvis"),
-])  # fmt: skip
-def test_what_no_person_does_is_said(walk: Conversion, change: Callable[[Clip], Clip], said: str) -> None:
-    faults = compare_with_recording(change(walk.clip), walk.fitted.motion, REST, "cmu_daz").faults
-    assert any(said in fault for fault in faults)
-
-
 def faults(folder: Path, written: SkeletonMap, chosen: SkeletonMap, **how: np.ndarray) -> tuple[str, ...]:
     """What is said of a walk that is written by one map and read by another."""
     file = performed(written, synthesize_clip("walking", 1, seconds=2.0), **how)
     return converted(write(folder, file.text()), chosen).fidelity.faults
 
 
-DAZ, BANDAI = replace(load_skeleton("cmu_daz"), calibration_frame=False), load_skeleton("bandai_namco")
+DAZ = replace(load_skeleton("cmu_daz"), calibration_frame=False)
 
 
 @pytest.mark.parametrize(("changes", "said"), [
@@ -111,45 +99,6 @@ def test_swapped_sides_without_toes_and_a_small_unit_are_said(tmp_path: Path) ->
     assert any(fault.startswith("the knees bend backwards") for fault in said)
     said = faults(tmp_path, DAZ, replace(DAZ, unit=0.0045))
     assert said == ("the legs are 0.34 m long, so the unit may be wrong",)
-
-
-def test_hips_that_turn_below_the_pelvis_are_said(tmp_path: Path) -> None:
-    """As where another program turns the joint above the hip, which its own files never turn."""
-    name, file = "cmu_motionbuilder", tree("cmu_motionbuilder")
-    written = performed(load_skeleton(name), synthesize_clip("walking", 1, seconds=1.0), sample=file)
-    column = 3 + 3 * file.names.index("LHipJoint")
-    for degrees in (0.0, 20.0):
-        written.values[:, column : column + 3] = [degrees, 0, 0]
-        faults = "; ".join(converted(write(tmp_path, written.text()), load_skeleton(name)).fidelity.faults)
-        assert ("left_hip moves relative to the pelvis by" in faults) == bool(degrees)
-
-
-def test_limbs_that_do_not_bend_have_no_axis(tmp_path: Path) -> None:
-    """Knees that lean outward on the skeleton itself, in a person who hardly moves."""
-    chosen = load_skeleton("fairmotion")
-    file, clip = own_tree(chosen), synthesize_clip("walking", 1, seconds=1.0)
-    for knee, side in (("lknee", 1), ("rknee", -1)):
-        file.offsets[file.names.index(knee)][0] += 8.0 * side
-        file.offsets[file.names.index(knee.replace("knee", "ankle"))][0] -= 8.0 * side
-    upright = np.eye(22)[0][:, None] * [np.pi / 2, 0, 0]
-    still = replace(clip, poses=np.broadcast_to(upright, clip.poses.shape))
-    faults = converted(write(tmp_path, performed(chosen, still, sample=file).text()), chosen).fidelity.faults
-    assert not any("bends about" in fault for fault in faults)
-
-
-@pytest.mark.parametrize(("joint", "turn", "said"), [
-    ("Head", [0.0, 0.0, 180.0], "the head is rotated by more than 110"),
-    ("Chest", [65.0, 0.0, 0.0], "left_collar is rotated by"),
-])  # fmt: skip
-def test_a_wrong_rest_is_said(tmp_path: Path, joint: str, turn: list[float], said: str) -> None:
-    """The map's rest with one joint turned further, about the axes of that joint."""
-    assert BANDAI.rest is not None
-    own = Rotation.from_euler("ZXY", BANDAI.rest[joint], degrees=True)
-    values = (own * Rotation.from_euler("ZXY", turn, degrees=True)).as_euler("ZXY", degrees=True).tolist()
-    chosen = replace(BANDAI, rest={**BANDAI.rest, joint: values})
-    turns = rest_turns(BANDAI, own_tree(BANDAI))
-    assert faults(tmp_path, BANDAI, BANDAI, turns=turns) == ()
-    assert any(said in fault for fault in faults(tmp_path, BANDAI, chosen, turns=turns))
 
 
 def test_palms_that_face_elsewhere_are_said(tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-import yaml
-from bvh_samples import own_tree, performed, person, random_turns, refuse, tree, write
+from bvh_samples import performed, person, refuse, tree, write
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, make_builtin_rest_joints
@@ -19,7 +18,7 @@ from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import compute_clip_kinematics
 from memmlp.motion.importing.convert import NONE, convert_recording
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder, verify_folder
-from memmlp.motion.importing.skeleton_map import SKELETONS, find_skeleton, load_skeleton
+from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = make_builtin_rest_joints()
@@ -172,30 +171,6 @@ def test_floors_as_told(walks: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(taken, scale.pop(), atol=1e-5)
     zero = import_folder(walks, tmp_path / "zero", ImportSettings(floor=0))
     assert [clip.floor for clip in zero.clips] == [0.0] * 3
-
-
-def test_a_calibration_pose_that_the_map_keeps_is_noted(walks: Path, tmp_path: Path) -> None:
-    kept = tmp_path / "kept.yaml"
-    kept.write_text((SKELETONS / "cmu_daz.yaml").read_text().replace("calibration_frame: true", ""))
-    (note,) = import_folder(walks, tmp_path / "out", ImportSettings(str(kept), floor=NONE)).notes
-    assert note.startswith("a.bvh and 2 more: frame 0 is far from frame 1")
-    assert import_folder(walks, tmp_path / "left", ImportSettings(floor=NONE)).notes == ()
-
-
-def test_several_up_axes_and_stances_of_one_skeleton_are_noted(tmp_path: Path) -> None:
-    chosen, path = replace(DAZ, up=None, rest=None), tmp_path / "auto.yaml"
-    content = yaml.safe_load((SKELETONS / "cmu_daz.yaml").read_text()) | {"up": "auto", "rest": "auto"}
-    path.write_text(yaml.safe_dump(content))
-    turns = random_turns(own_tree(chosen), 1)
-    for name, up in (("a", "y"), ("b", "z"), ("c", "y")):
-        text = performed(replace(chosen, up=up), WALK, turns=turns).text()
-        write(tmp_path / "source", text, f"{name}.bvh")
-    notes = import_folder(tmp_path / "source", tmp_path / "out", ImportSettings(skeleton=str(path))).notes
-    for start in (
-        "cmu_daz: up differs between clips: y in 2 clips, z in 1 clips",
-        "cmu_daz: the zero pose of 3",
-    ):
-        assert [note for note in notes if note.startswith(start)]
 
 
 def test_clips_with_faults_are_left_out_where_only_sound_ones_are_wanted(tmp_path: Path) -> None:

@@ -56,8 +56,6 @@ def test_wrong_maps_are_refused(tmp_path: Path) -> None:
     for changes, said in (
         ({"unit": "cm"}, "unit"), ({"unit": float("nan")}, "unit"), ({"name": None}, "keys"),
         ({"up": "x"}, "y, z or auto"), ({"calibration_frame": 1}, "true or false"),
-        ({"rest": "standing"}, "rest"), ({"rest": "frame -1"}, "frame N"), ({"rest": {"hip": 90}}, "rest"),
-        ({"rest": {"hip": [90, "a", 0]}}, "rest"), ({"rest": 7}, "rest"), ({"colour": "red"}, "keys"),
         ({"joints": {}}, "joints.pelvis"), ({"joints": JOINTS_OF_DAZ | {"tail": "hip"}}, "joints.tail"),
         ({"joints": JOINTS_OF_DAZ | {"head": True}}, "joints.head"),
         ({"joints": JOINTS_OF_DAZ | {"head": "neck"}}, "neck"),
@@ -99,9 +97,7 @@ def test_a_map_of_other_joints_is_refused(tmp_path: Path) -> None:
 def test_names_of_nodes():
     for nodes, plain in (
         ("mixamorig:Hips mixamorig:LeftArm", "Hips LeftArm"), ("mixamorigHips mixamorigHead", "Hips Head"),
-        ("Character1_Hips Character1_LeftArm", "Hips LeftArm"), ("a:Hips b:Hips", "a:Hips b:Hips"),
         ("m_avg_root m_avg_L_Hip m_avg_R_Hip", "root L_Hip R_Hip"), ("joint_1 joint_2", "1 2"),
-        ("RL_BoneRoot CC_Base_Hip CC_Base_L_Foot", "RL_BoneRoot Hip L_Foot"),
         ("Armature a:b:Hips a:b:Head", "Armature Hips Head"), ("Spine Spine1 Spine2", "Spine Spine1 Spine2"),
     ):  # fmt: skip
         assert skeleton_map.strip_namespace(nodes.split()) == plain.split()

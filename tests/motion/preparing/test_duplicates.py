@@ -20,7 +20,7 @@ from memmlp.motion.importing.import_folder import import_folder
 from memmlp.motion.preparing import duplicates
 from memmlp.motion.preparing import survey as survey_module
 from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
-from memmlp.motion.preparing.duplicates import BONES, REACH, assign_parts, mark_frames, mark_turns
+from memmlp.motion.preparing.duplicates import BONES, assign_parts
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 from memmlp.motion.preparing.splits import Assignment, MixedSplit, SeededSplit
 from memmlp.motion.preparing.survey import survey_folder
@@ -162,15 +162,6 @@ def test_a_clip_that_shares_a_stretch_is_found(root: Path, change: Callable[[Cli
     assert survey_folder(root).duplicates == expected
 
 
-def test_overlapping_windows_of_a_recording_are_one_group(root: Path):
-    """Each overlaps the next by two seconds, and the first and the last have nothing in common."""
-    recording = synthesize_clip("reaching", 5, seconds=10.0)
-    for start in range(0, 480, 120):
-        write_clip(root / f"window_{start:03}.npz", cut(recording, start, start + 240))
-    found = survey_folder(root).duplicates
-    assert (set(found.values()), len(found)) == ({"window_000"}, 3)
-
-
 def test_repetitions_cuts_and_common_rest_poses_are_different(root: Path):
     recording = synthesize_clip("reaching", 5, seconds=10.0)
     for name, (start, end) in {"first": (0, 300), "second": (300, 600)}.items():
@@ -182,13 +173,6 @@ def test_repetitions_cuts_and_common_rest_poses_are_different(root: Path):
         late = replace(clip, poses=poses, trans=np.concatenate([place, clip.trans]))
         write_clip(root / f"{activity}_again.npz", late)
     assert survey_folder(root).duplicates == {}
-
-
-def test_a_clip_too_short_for_a_stretch_has_no_marks_beyond_its_middle():
-    for frames in (1, 2 * REACH, 2 * REACH + 1):
-        for marks in mark_frames(cut(recorded("walking"), 0, frames)):
-            assert set(marks.frames) <= {REACH}
-            assert marks.signatures.shape == (len(marks.frames), 24)
 
 
 def test_copies_are_drawn_together(root: Path, tmp_path: Path):
@@ -228,15 +212,6 @@ def test_a_limb_that_moves_otherwise_is_another_take(tmp_path: Path):
     write_clip(tmp_path / "a.npz", clip)
     write_clip(tmp_path / "b.npz", replace(clip, poses=poses))
     assert survey_folder(tmp_path).duplicates == {}
-
-
-def test_short_and_still_clips_have_no_marks():
-    clip = synthesize_clip("walking", 1, seconds=6.0)
-    for frames in (1, 2, 61):
-        assert (
-            len(mark_turns(replace(clip, poses=clip.poses[:frames], trans=clip.trans[:frames])).frames) == 0
-        )
-    assert len(mark_turns(replace(clip, poses=np.zeros_like(clip.poses))).frames) == 0
 
 
 @pytest.mark.slow

@@ -99,17 +99,6 @@ def test_links_and_copies_are_known_across_sources(home):
     assert len({clip.split for clip in manifest.clips if clip.name in ("b/take9", "a/take1/2")}) == 1
 
 
-def test_errors_name_the_source(home):
-    shutil.rmtree(home / "one" / "take0")
-    shutil.rmtree(home / "one" / "take1")
-    with pytest.raises(InputError, match=r"data\.sources\.a"):
-        prepare_cache(mixed(home, a="one", b="two"), home / "cache")
-    with pytest.raises(InputError, match=r"data\.root"):
-        NamedFolders.from_paths([home / "x" / "clips", home / "y" / "clips"])
-    with pytest.raises(InputError, match=r"data\.root=.*none"):
-        prepare_cache(mixed(home, a="none", b="two"), home / "cache")
-
-
 @pytest.mark.parametrize("drawn_by", ["frames", "clips"])
 def test_shares_say_how_often_a_window_is_of_each_source(home, drawn_by):
     prepare_cache(mixed(home, a="one", b="two"), home / "cache")

@@ -71,11 +71,9 @@ SESSIONS = [(f"{name.rpartition('/')[0]}/session{name[-1]}/take", part) for name
     (TAKES, {"groups": ["salsa/(.*)"]}, "2 test clips share no group with other clips"),
     (TAKES, {"groups": ["own/(.*?)/"]}, ""),
     (TAKES[:2], {}, ""),  # all in one folder, which is no person
-    ([("a/1", "train"), ("a/2", "val"), ("b/1", "test")], {}, ""),
     ([(f"x/{name}", part) for name, part in TAKES], SOURCES, "2 test clips"),
     (FLAT, {"groups": ["salsa/(.*)"]}, "1 test clips share no group with other clips"),
     (SESSIONS, {}, "2 test clips share no group with other clips"),
-    ([("c1/a", "train"), ("c2/a", "test"), ("c3/a", "train")], {}, ""),  # no folder is shared
 ])  # fmt: skip
 def test_folders_with_clips_in_training_and_in_test_are_told(parts, split, said):
     """A folder is often a person, and no shipped pattern knows a custom folder."""

@@ -85,8 +85,6 @@ def test_absent_persons_are_missing_and_clips_of_nobody_refused():
 
 
 @pytest.mark.parametrize(("changes", "said"), [
-    ({"persons": {"(": "a"}}, r"data.split.persons='('"),
-    ({"persons": {"a": r"\1"}}, r"data.split.persons='a'"),
     ({"kinds": {**KINDS, "sports": Kind(("a1",), 0, 0)}}, "a1 has two kinds"),
     ({"kinds": {"walking": Kind(("a1", "a2"), 2, 1)}}, "data.split.kinds.walking: must have 3 persons"),
 ])  # fmt: skip

@@ -1,20 +1,14 @@
 """Splits: seeded, by group, by published lists, by subset."""
 
-import re
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import find_packaged_folder
-from memmlp.config.build_request import build_motion
-from memmlp.config.compose import compose_config
 from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
-from memmlp.sweep.sweep_file import load_sweep
 
 NAMES = [f"salsa/{n:02}" for n in range(1, 31)] + [f"martial/{n:02}" for n in range(1, 11)]
 TWINS = [rf"salsa/(?:{n:02}|{n + 15:02})$" for n in range(1, 16)]
@@ -36,22 +30,6 @@ def test_seeded_is_a_partition_whatever_the_order():
     counts = [list(parts.values()).count(part) for part in ("train", "val", "test")]
     assert counts == [28, 4, 8]
     assert seeded(0.2, 0.1, 4).assign(NAMES).parts != parts
-
-
-def test_s3_is_as_table_3_says(tmp_path: Path):
-    """By clip and in S1's ratio, with persons on both sides, who still are the groups of statistics."""
-    names = [f"KIT/{subject}/take{take:02}_poses" for subject in range(10) for take in range(40)]
-    split = build_motion(compose_config(["data=amass_s3", f"data.root={tmp_path}"])).clips.split
-    assert isinstance(split, SeededSplit)
-    table = load_sweep(find_packaged_folder("sweeps") / "table03.yaml")
-    (note,) = (line for line in table.notes if "split" in line)
-    percent, seed = re.search(r"by clip .*, (\d+) % for testing, drawn with seed (\d+)", note).groups()
-    assert (split.test, split.seed) == (int(percent) / 100, int(seed))
-    found = split.assign(names)
-    assert len(part(found.parts, "test")) == split.test * len(names)
-    sides = {side: {found.groups[name] for name in part(found.parts, side)} for side in ("train", "test")}
-    assert sides["test"] <= sides["train"]
-    assert len(sides["train"]) == 10
 
 
 def test_groups_and_subjects_within_archives_stay_together():
@@ -221,48 +199,3 @@ def test_a_column_file_ties_clips_beside_patterns(tmp_path):
     file.write_text(file.read_text().replace("martial\n", "other\n"))
     changed = seeded(0.3, 0.1, 0, TWINS, groups_file=file)
     assert len({str(one.describe()) for one in (split, bare, changed)}) == 3
-
-
-def test_subsets_are_found_within_archives_and_by_folders_of_ones_own():
-    split = SubsetSplit(["CMU", "mine"], ["MPI_HDM05"])
-    names = ["amass-1/CMU/01/a", "amass-2/MPI_HDM05/dg/b", "mine/CMU/01/c", "other/CMU/d"]
-    found = split.assign(names)
-    assert split.find_missing_entries(names) == ()
-    assert [part is None for part in found.parts.values()] == [False, False, False, True]
-    assert found.parts["amass-2/MPI_HDM05/dg/b"] == "test"
-    with pytest.raises(InputError, match=r"data\.split.*CMU/01"):
-        SubsetSplit(["KIT"], ["CMU/01"])
-
-
-ARCHIVES = {  # folder in the first release: (folder in later ones, a subject's folder)
-    "ACCAD": ("ACCAD", "Female1General_c3d"), "BMLhandball": ("BMLhandball", "S01_Expert"),
-    "BMLmovi": ("BMLmovi", "Subject_1_F_MoSh"), "BioMotionLab_NTroje": ("BMLrub", "rub001"),
-    "CMU": ("CMU", "01"), "CNRS": ("CNRS", "283"), "DFaust_67": ("DFaust", "50002"),
-    "DanceDB": ("DanceDB", "20120731_StefanosTheodorou"), "EKUT": ("EKUT", "126"),
-    "Eyes_Japan_Dataset": ("EyesJapanDataset", "hamada"), "GRAB": ("GRAB", "s1"),
-    "HUMAN4D": ("HUMAN4D", "S1"), "HumanEva": ("HumanEva", "S1"), "KIT": ("KIT", "3"),
-    "MOYO": ("MOYO", "220923_yogi"), "MPI_HDM05": ("HDM05", "dg"), "MPI_Limits": ("PosePrior", "03099"),
-    "MPI_mosh": ("MoSh", "00008"), "SFU": ("SFU", "0005"), "SOMA": ("SOMA", "soma_subject1"),
-    "SSM_synced": ("SSM", "20160330_03333"), "TCD_handMocap": ("TCDHands", "ExperimentDatabase"),
-    "TotalCapture": ("TotalCapture", "s1"), "Transitions_mocap": ("Transitions", "mazen_c3d"),
-    "WEIZMANN": ("WEIZMANN", "0"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("release", ["first", "later", "SMPL-X"])
-def test_all_archives_of_amass_in_each_release(tmp_path: Path, release: str):
-    """The counts of the protocols that docs/guides/amass.md describes, on ten clips of each archive."""
-    first = [f"{top}/{subject}/{n} a clip_poses" for top, (_, subject) in ARCHIVES.items() for n in range(10)]
-    lists = write_lists(tmp_path, [name for name in first if name.startswith(("CMU", "Bio", "MPI_HDM"))])
-    names = [name.replace(top := name.split("/")[0], ARCHIVES[top][0], 1) for name in first]
-    if release == "SMPL-X":
-        names = [name.replace("_poses", "_stageii").replace(" ", "_") for name in names]
-    names = first if release == "first" else names
-    protocols = {"amass_s1": (23, 7), "amass_s2": (120, 20), "amass_s3": (225, 25)}
-    for protocol, expected in protocols.items():
-        words = [f"data={protocol}", f"data.root={tmp_path}", "data.split.val=0"]
-        words += [f"data.split.folder={lists}"] if protocol == "amass_s1" else []
-        split = build_motion(compose_config(words)).clips.split
-        found = Counter(split.assign(names).parts.values())
-        assert (found["train"], found["test"]) == expected
-        assert not split.find_missing_entries(names)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit
@@ -45,17 +45,6 @@ def test_one_bad_file_never_stops_a_folder(root):
     }  # fmt: skip
     assert len(found.clips) == 4
     assert all(file.reason.isprintable() for file in found.skipped)
-
-
-def test_other_units_are_skipped_and_odd_clips_are_reported(root):
-    clip = read_clip(root / "a" / "0.npz", "")
-    write_clip(root / "degrees.npz", type(clip)("x", np.degrees(clip.poses), clip.trans, 60.0))
-    poses = clip.poses.copy()
-    poses[:, 0] = [0.0, 0.1, 0.0]
-    write_clip(root / "x.npz", type(clip)("x", poses, 0.1 * clip.trans + [0, 5, 0], 60.0))
-    found = survey_folder(root)
-    assert [file.file for file in found.skipped] == ["degrees.npz"]
-    assert set(found.unusual) == {"x"}
 
 
 def test_no_frames_are_in_two_parts_however_they_were_copied(root, tmp_path):

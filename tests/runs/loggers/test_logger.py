@@ -5,15 +5,14 @@ import threading
 from pathlib import Path
 
 import pytest
-from fake_logger import FakeLogger, Server, a_run, an_outdated_evaluation, losses
+from fake_logger import FakeLogger, Server, a_run, losses
 from processes import until
 
 from memmlp.common.files import write_json
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import VERSIONS
 from memmlp.runs.loggers import logger as module
 from memmlp.runs.loggers.logger import Loggers, LogReader, Session, read_run_facts, sync_runs
-from memmlp.runs.lookup import add_tags, set_note
+from memmlp.runs.lookup import add_tags
 from memmlp.runs.run import Run
 
 
@@ -142,32 +141,6 @@ def test_status_is_that_of_the_folder(tmp_path: Path):
     run.deployment("fp32-0").finish({})
     assert read_run_facts(run).status == "done"
     assert read_run_facts(run, running=True).ended is None
-
-
-def test_name_origin_data_labels_and_note(tmp_path: Path):
-    run = a_run(tmp_path, data={"name": "mocap"}, memory={"layers": [2]})
-    run.write_manifest(
-        {"name": "memory=gru · seed 1", "user": "somebody", "git": {"commit": "abc", "dirty": False}}
-    )
-    add_tags(run, ["good"])
-    set_note(run, "a note")
-    facts = read_run_facts(run)
-    assert facts.name == "memory=gru · seed 1"
-    assert facts.data == ("mocap", "d" * 64)
-    assert (facts.tags, facts.note) == (("good",), "a note")
-    assert (facts.origin["user"], facts.origin["commit"]) == ("somebody", "abc")
-    assert facts.config["memory.layers"] == "[2]"
-
-
-def test_results_by_an_earlier_recipe_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run = a_run(tmp_path, evaluation={"ik": "off"})
-    an_outdated_evaluation(run)
-    monkeypatch.setitem(VERSIONS, "mode.stream", 0)
-    now = read_run_facts(run).fingerprint
-    assert read_run_facts(run).outdated == ""
-    monkeypatch.setitem(VERSIONS, "mode.stream", 1)
-    assert read_run_facts(run).outdated == "stream (mode.stream 0 -> 1)"
-    assert read_run_facts(run).fingerprint != now
 
 
 def test_a_tail_reads_the_last_of_repeated_steps_and_then_what_follows(tmp_path: Path):

@@ -10,7 +10,6 @@ from fake_logger import a_run as begun
 from fake_logger import an_outdated_evaluation
 
 from memmlp.common.files import write_json
-from memmlp.runs.loggers import mlflow as module
 from memmlp.runs.loggers.logger import Session, sync_runs
 from memmlp.runs.loggers.mlflow import MLflow
 from memmlp.runs.lookup import add_tags, remove_tags, set_note
@@ -114,30 +113,6 @@ def test_what_changed_replaces_the_run(store: Path, tmp_path: Path):
     assert tags["memmlp.failure"] == "loss is nan at step 5"
     assert not {"memmlp.label.good", "mlflow.note.content", "memmlp.outdated_results"} & tags.keys()
     assert history(store, run, "train/loss") == [*((step, 1 / step) for step in range(1, 5)), (5, 77.0)]
-
-
-def test_many_values_go_in_batches(store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from mlflow import MlflowClient
-    from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_BATCH
-
-    assert (module.PARAMS, module.METRICS) == (MAX_PARAMS_TAGS_PER_BATCH, MAX_METRICS_PER_BATCH)
-    monkeypatch.setattr(module, "PARAMS", 4)
-    monkeypatch.setattr(module, "METRICS", 10)
-    sizes: list[tuple[int, int]] = []
-    log_batch = MlflowClient.log_batch
-
-    def spy(client: Any, run_id: str, metrics: Any = (), params: Any = (), tags: Any = ()) -> None:
-        sizes.append((len(metrics), len(params)))
-        log_batch(client, run_id, metrics=metrics, params=params, tags=tags)
-
-    monkeypatch.setattr(MlflowClient, "log_batch", spy)
-    run = Run.from_id(tmp_path, "2" * 16)
-    run.begin("memmlp", {f"key{i}": i for i in range(10)}, data="d", prerequisite=None)
-    for step in range(6):
-        run.log(step, {"a": 1.0, "b": 2.0})
-    sync_runs(MLflow(None, store), [run], print)
-    assert [size for size in sizes if size != (0, 0)] == [(0, 4), (0, 4), (0, 2), (10, 0), (2, 0)]
-    assert len(history(store, run, "train/b")) == 6
 
 
 def test_a_server_that_is_not_there_is_told(tmp_path: Path):
