@@ -1,7 +1,5 @@
 """`memmlp eval` and `memmlp import-weights`: the metrics of networks that are not trained here and now."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,18 +1,14 @@
-"""`memmlp loggers` and `memmlp mlflow`: show run folders in MLflow, TensorBoard and W&B."""
+"""`memmlp loggers`: show run folders in MLflow, TensorBoard and W&B."""
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
     from memmlp.runs.loggers.logger import RunLogger
@@ -75,21 +71,3 @@ def _make_loggers(names: Sequence[str], uri: str | None, project: str, outputs: 
         "wandb": lambda: WandB(project, outputs),
     }
     return [makers[name]() for name in dict.fromkeys(names)]
-
-
-@click.command("mlflow")
-@click.option("--port", default=5000)
-@outputs_option
-def mlflow(port: int, outputs: Path) -> None:
-    """Open MLflow's page (needs pip install 'memmlp[mlflow]')."""
-    from memmlp.runs.loggers.mlflow import MLflow
-
-    store = MLflow(None, outputs).place
-    program = shutil.which("mlflow")
-    try:
-        metadata.version("mlflow")  # mlflow-skinny has the program, but not the page
-    except metadata.PackageNotFoundError:
-        program = None
-    if program is None:
-        raise InputError("memmlp mlflow: needs mlflow: pip install 'memmlp[mlflow]'")
-    os.execv(program, [program, "ui", "--backend-store-uri", store, "--port", str(port)])

@@ -1,7 +1,5 @@
 """The command `memmlp`. A sub-command is imported only when it is called, so that --help is quick."""
 
-from __future__ import annotations
-
 import difflib
 import errno
 import importlib
@@ -41,7 +39,6 @@ COMMANDS = {
     "report": Command("ui", "report", "Write the page of `memmlp ui` as one HTML file."),
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
     "loggers": Command("loggers", "loggers", "Add runs to MLflow, TensorBoard or W&B."),
-    "mlflow": Command("loggers", "mlflow", "Open MLflow's page of the runs."),
     "ui": Command("ui", "ui", "Show runs, sweeps and searches on a local web page, live."),
     "eval": Command("evaluate", "evaluate", "Show metrics and write predictions of a finished run."),
     "import-weights": Command("evaluate", "import_weights", "Make a run from weights that authors publish."),

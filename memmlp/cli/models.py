@@ -1,7 +1,5 @@
 """`memmlp models`: the trained networks that the package ships."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

@@ -1,8 +1,5 @@
 """The summary that `memmlp train` prints at the end of a run."""
 
-from __future__ import annotations
-
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,8 +13,6 @@ from memmlp.common.text_formats import make_console
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.measured_run import (
     CORE_FRACTION_KEYS,
-    SAME_ERROR_TOLERANCE,
-    SHARED_METRIC,
     Errors,
     MeasuredRun,
     load_measured_run,
@@ -71,37 +66,6 @@ def list_run_warnings(run: Run) -> Iterator[str]:
         )
     if remark := warn_if_hardly_trained(count_training_frames(run)):
         yield remark
-
-
-def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
-    """Print the errors of several networks, by name, on the same test clips, and their costs. The errors are
-    in stream mode if it was measured, otherwise in window mode. If a network's branches differ, each has a
-    column."""
-    results = {name: outcome.results for name, outcome in outcomes.items()}
-    mode = "stream" if all("stream" in own for own in results.values()) else "window"
-    branches = {name: _list_distinct_branches(own[mode]) for name, own in results.items()}
-    columns = [(name, branch) for name, own in branches.items() for branch in own]
-    headers = [f"{name}\n{branch}" if len(branches[name]) > 1 else name for name, branch in columns]
-    errors = [results[name][mode][branch] for name, branch in columns]
-    table = _make_error_table(f"side by side, {mode}", headers, errors)
-    if all("latency" in own for own in results.values()):
-        costs = [select_deployed_measurements(results[name]["latency"]) for name, _ in columns]
-        table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
-        table.add_row("parameters", "M", *(f"{cost['parameters'] / 1e6:.2f}" for cost in costs))
-    make_console().print(table)
-
-
-def _list_distinct_branches(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the branches with distinct positions; a network without a position branch has only one."""
-    differing: list[str] = []
-    for branch in (branch for branch in BRANCHES if branch in branches):
-        errors = branches[branch][SHARED_METRIC]
-        if not any(
-            math.isclose(errors, branches[other][SHARED_METRIC], rel_tol=SAME_ERROR_TOLERANCE)
-            for other in differing
-        ):
-            differing.append(branch)
-    return differing
 
 
 def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:

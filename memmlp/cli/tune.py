@@ -227,10 +227,6 @@ def write_results(setup: SearchSetup, study: Study) -> None:
     results.write_trials(study, setup.folder / "trials.csv")
     groups = [path.name for path in find_packaged_folder("conf").iterdir() if path.is_dir()]
     results.write_experiments(study, setup.folder, groups)
-    try:
-        results.write_plots(study, setup.folder / "study.html")
-    except InputError as error:  # without the extra
-        click.echo(str(error), err=True)
 
 
 def print_summary(setup: SearchSetup, study: Study) -> None:

@@ -3,8 +3,6 @@
 JSON does not have NaN and infinities, so they are stored as the strings "nan", "inf" and "-inf".
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

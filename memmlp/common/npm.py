@@ -2,8 +2,6 @@
 `NPM_CONFIG_REGISTRY`, or registry.npmjs.org by default. Tarballs are kept in the user's cache folder. They
 are read member by member, and never unpacked."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """This process and its children: garbage collection, signals, imports, and CPU core usage."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import gc

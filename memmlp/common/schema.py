@@ -1,8 +1,6 @@
 """Parses JSON and YAML of unknown origin, and checks values against types. Such a file may be hostile, so its
 size, depth and aliases are bounded before its content is expanded."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math

@@ -1,7 +1,5 @@
 """Declares config keys, with their rules, defaults and sizes. This module does not import torch."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator

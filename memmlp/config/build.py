@@ -1,7 +1,5 @@
 """Builds the objects that a composed config describes."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Builds the run request of a composed config. It does not import torch, so planning is fast."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Checks of a composed config before a run starts. Each error is one line that names the key."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import re

@@ -1,7 +1,5 @@
 """A Hydra config source with the options that components declare, in addition to YAML files."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Composes and checks configs from overrides. Every error becomes an InputError of one line."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Opens finished runs with their experiments and data, and makes runs from published weights."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -11,8 +11,6 @@ A run's config does not activate packages, for security: a run's folder may come
 on the path could be executed.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """The keys of `memmlp train`'s config, with types and limits. Components declare their own keys."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

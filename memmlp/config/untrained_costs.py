@@ -1,7 +1,5 @@
 """Sizes and times of untrained networks, for tables that show only costs."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path

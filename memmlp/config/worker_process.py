@@ -1,7 +1,5 @@
 """A worker's process: for each task of a plan, it builds the experiment and finishes the run."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Deployment of a trained network: export to ONNX, parity check, timing and lower precision."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -13,8 +13,6 @@ Outputs:
 - `state.*.next`: the new states.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import warnings

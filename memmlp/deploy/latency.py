@@ -1,7 +1,5 @@
 """CPU time and number of operations of a streaming step."""
 
-from __future__ import annotations
-
 import copy
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence

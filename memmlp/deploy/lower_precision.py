@@ -5,8 +5,6 @@ Only the inner layers of a network change. The first and last modules stay in fl
 jitter.
 """
 
-from __future__ import annotations
-
 import logging
 import shutil
 import tempfile

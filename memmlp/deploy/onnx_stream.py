@@ -1,7 +1,5 @@
 """Exported steps in ONNX Runtime, on one thread and without torch."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ of these graphs to older opsets. So this module rewrites the operators that diff
 rejects a graph with an operator that it cannot rewrite.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Parity check: stream the same clip through an ONNX file and torch, and compare the results."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

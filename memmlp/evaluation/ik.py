@@ -4,8 +4,6 @@ The paper runs at most 15 iterations of L-BFGS from the rotation branch's pose (
 no. 11).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

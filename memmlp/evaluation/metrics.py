@@ -4,8 +4,6 @@ Positions (N, 22, 3) are metres in the world at 60 Hz; rotations (N, 22, 3, 3) a
 the root rotation is global.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -17,8 +17,6 @@ Some networks are evaluated differently in window mode:
 - A network that predicts all windows together gets the whole clip (`MotionModel.takes_whole_clip`). It does
   not support the mode `stream`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

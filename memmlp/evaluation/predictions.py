@@ -1,7 +1,5 @@
 """Prediction files: arrays together with the truth, and clips for other programs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

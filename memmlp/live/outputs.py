@@ -23,8 +23,6 @@ frames between two poses are interpolated. After a longer break, the network res
 the files, and reported.
 """
 
-from __future__ import annotations
-
 import errno
 import socket
 import warnings

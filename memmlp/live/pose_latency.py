@@ -1,7 +1,5 @@
 """CPU time of an end-to-end pose: from a sample of the trackers to joints in the caller's space."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Hashable, Mapping
 from pathlib import Path

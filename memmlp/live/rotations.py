@@ -1,8 +1,6 @@
 """Rotations and forward kinematics on NumPy arrays, one frame at a time. Quaternions are x, y, z, w.
 `memmlp.motion.geometry` has the same functions for torch tensors, which a live stream does not import."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

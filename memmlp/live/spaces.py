@@ -13,8 +13,6 @@ of a headset is almost the pose of the head. A local rotation is relative to the
 axes of the T-pose.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Checks of a stream's samples: malformed trackers are rejected, and implausible values cause a warning."""
 
-from __future__ import annotations
-
 import math
 import sys
 import warnings

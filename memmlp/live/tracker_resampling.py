@@ -18,8 +18,6 @@ The rules apply in this order:
   by more than `GAP` seconds.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

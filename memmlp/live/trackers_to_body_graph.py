@@ -20,8 +20,6 @@ All inputs and outputs are in the chosen frame of reference (memmlp.live.spaces)
 trackers, other rates and gaps (see memmlp.live.tracker_resampling). NaN inputs give NaN outputs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

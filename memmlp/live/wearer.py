@@ -4,8 +4,6 @@ A network is trained on bodies of one size, with the floor at height zero. So in
 the floor by the network's body height divided by the user's. Output positions are scaled back. Angles stay
 the same."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Frames of reference: motion lives in AMASS' world (Z up, metres). A rest pose li
 up, the person faces +Z, left is +X, T-pose). The root's rotation turns it into the world. A
 body joint's rotation is local, relative to its parent; the root's is global."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Exports clips to files that other programs open: a folder of AMASS npz, or a single file."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The component slot `coordinates`: the local coordinates of a network's inputs and outputs."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -4,8 +4,6 @@ Files do not state their units. Wrong units change sizes by factors of 39 to 100
 directions by 90 degrees. So the limits can be wide: they accept jumping, lying, crawling, climbing, and
 dancing far from the origin, on a floor at any height."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Build a config's network, prepare it for training, and load its trained weights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checkpoints: own files of tensors and JSON values, without pickle, and files that authors publish."""
 
-from __future__ import annotations
-
 import json
 import re
 import zipfile

@@ -1,7 +1,5 @@
 """Denoising diffusion: noise schedules, noise for training signals, and sampling."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The MLP block of Mem-MLP and AGRoL, and layers for several networks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -7,8 +7,6 @@ axis.
 The order of the four limbs in tensors is left arm, right arm, left leg, right leg.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The predictor slot: maps the backbone's hidden state to motion (Sec. 3.2.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -3,8 +3,6 @@
 Its parts are trained one after the other (memmlp.training.train_sage), and then together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast

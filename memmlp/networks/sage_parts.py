@@ -6,8 +6,6 @@ decoder computes rotations from both. The refiner is in memmlp.networks.refiner.
 384).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """The common settings of networks without slots. This module does not import torch."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar

@@ -4,8 +4,6 @@ Values that depend on a single frame are computed once, when the frame enters th
 state. The last layers compute only the newest frame.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Transformer blocks for several networks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ It works frame by frame in network space: a frame [X | Theta] (252) is encoded, 
 132 rotation components.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

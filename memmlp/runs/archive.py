@@ -3,8 +3,6 @@
 Archives are not trusted: only names of run files are accepted, nothing is executed or unpickled, and the run
 is moved to the outputs folder only if it is complete and matches the digests in its files."""
 
-from __future__ import annotations
-
 import errno
 import mmap
 import os

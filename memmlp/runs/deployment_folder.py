@@ -1,7 +1,5 @@
 """The folder of a deployment: a run's ONNX files and their measurements."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The environment of a run: code version, packages and hardware."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import functools

@@ -1,7 +1,5 @@
 """Evaluation files; each contains its own digest."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

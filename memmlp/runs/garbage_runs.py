@@ -1,7 +1,5 @@
 """Finds and deletes unneeded runs: failed runs, runs with older component versions, and orphans."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Finds and describes runs in an outputs folder, and edits their tags and notes, which do not affect ids."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

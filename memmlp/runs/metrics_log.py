@@ -1,7 +1,5 @@
 """A run's metrics log: an append-only file with one JSON line for each record."""
 
-from __future__ import annotations
-
 import errno
 import functools
 import json

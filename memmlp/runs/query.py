@@ -1,8 +1,6 @@
 """Parses conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and collects the values of runs. A
 condition consists of comparisons, `and` and `or`; `and` binds more tightly."""
 
-from __future__ import annotations
-
 import difflib
 import operator
 import re

@@ -1,7 +1,5 @@
 """The controller of a sweep: it starts workers while runs are missing, and shows the progress."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The live table of a sweep: the state of each variant and seed, and the reasons of failures."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

@@ -18,8 +18,6 @@ axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, in which each var
 axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or several grids
 """
 
-from __future__ import annotations
-
 import difflib
 import itertools
 import math

@@ -5,8 +5,6 @@ worker at a time works on a run. If a worker is killed, or hangs for longer than
 continues the run from the last checkpoint. `config/worker_process.py` performs a single task.
 """
 
-from __future__ import annotations
-
 import itertools
 import sys
 import time

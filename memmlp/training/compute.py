@@ -1,7 +1,5 @@
 """The compute of a training: FLOPs of the matrix products in its steps."""
 
-from __future__ import annotations
-
 import copy
 import warnings
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Choose and describe a run's device, and set torch's number of threads."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

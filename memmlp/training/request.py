@@ -3,8 +3,6 @@
 This module does not import torch, so planning a sweep and finding finished runs are fast.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -3,8 +3,6 @@
 A network that is trained only on true history learns to rely on it, but does not have it at run time
 (exposure bias). A rollout can therefore let the network predict its own history, as in a live stream."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple

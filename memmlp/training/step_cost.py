@@ -1,7 +1,5 @@
 """The cost of a training step: its processor time, and the time of its matrix products alone."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

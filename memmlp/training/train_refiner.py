@@ -1,7 +1,5 @@
 """The training of a refiner, on the motion that a trained network streams."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -1,4 +1,4 @@
-"""`memmlp loggers sync` and `memmlp mlflow`, and training with loggers, as a person types them."""
+"""`memmlp loggers sync`, and training with loggers, as a person types them."""
 
 from pathlib import Path
 

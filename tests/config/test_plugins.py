@@ -213,7 +213,7 @@ def test_an_executor_of_ones_own(folder: Path):
     write(folder, {"mine.py": "class Mine:\n    def __init__(self, *given):\n        self.given = given\n"})
     engine, words, rest = split_executor(["executor=mine.Mine", "executor.queue=long", "seed=1"])
     assert (engine, words, rest) == ("mine.Mine", {"queue": "long"}, ("seed=1",))
-    made = Workers(engine, words).start_executor(folder, [], gpus=False)
+    made = Workers(engine, words).start_executor(folder, [])
     assert made.given == (folder / "workers/%j", {"queue": "long"})  # type: ignore[attr-defined]
     with pytest.raises(InputError, match=r"executor.queue: needs executor=PATH"):
         split_executor(["executor.queue=long"])

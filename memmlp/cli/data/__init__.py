@@ -1,7 +1,5 @@
 """`memmlp data`: make, import, verify, prepare, inspect and export motion."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,7 +1,5 @@
 """`memmlp data import`, `verify` and `skeleton`: import clips with other skeletons."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`memmlp runs`: list, show, compare, tag, clean up and move run folders."""
 
-from __future__ import annotations
-
 import click
 
 from memmlp.cli.runs.listing import list_runs

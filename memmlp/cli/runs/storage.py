@@ -1,7 +1,5 @@
 """`memmlp runs tag`, `note`, `gc`, `export` and `import`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -13,8 +13,6 @@ a message without numbers is null. A packet without a time gets its arrival time
 sample. It serves to count missing packets, and to drop packets that arrive out of order.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import logging

@@ -1,7 +1,5 @@
 """Writes a static website: the page, ONNX Runtime, networks, clips, and a service worker."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import json

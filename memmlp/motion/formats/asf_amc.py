@@ -6,8 +6,6 @@ start with the bone's rotation. A bone without children also has an end site. Le
 In the file they are inches times the factor `length` of `:units`. Y is up.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ on column vectors). Position channels replace the numbers in OFFSET.
 Written files have 22 joints with end sites, centimetres, Y up, and the body's T-pose as zero pose.
 """
 
-from __future__ import annotations
-
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence

@@ -5,8 +5,6 @@ T-pose on the floor and faces +Z. Each joint has a node with the joint's name an
 root is translated. The format is specified by the Khronos Group (glTF 2.0.1).
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Motion on a file's own skeleton: the common class for all formats that can be imported."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

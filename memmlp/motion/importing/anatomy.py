@@ -4,8 +4,6 @@ A stance is the pose of a person who stands upright. All positions (..., 22, 3) 
 `mapped` (22,) is true for the joints that a file has.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple

@@ -2,8 +2,6 @@
 conversion are not used: forward kinematics poses the clip, and the positions to compare come directly from
 the file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -4,8 +4,6 @@ Joints of arms and legs are found by typical words, each below the previous join
 over the nodes between pelvis and arms. The head is a node named head, or else the end of the longest chain
 above the arms."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

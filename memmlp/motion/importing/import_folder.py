@@ -1,7 +1,5 @@
 """Imports a folder of recordings as AMASS npz files with a record, or checks it by a trial import."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

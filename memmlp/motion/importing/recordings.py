@@ -1,8 +1,6 @@
 """Finds and reads recordings, and finds their true frame rates. To add a format, write a module in
 `memmlp.motion.formats` with a function `read(path) -> Recording`, and add it to `READERS`."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 from collections.abc import Callable, Mapping

@@ -6,8 +6,6 @@ folders. Its files end in `_stageii`, with `_` instead of blanks. BABEL's paths 
 an additional folder in front, as in `BMLrub/BioMotionLab_NTroje/...` or `archive-1/CMU/...`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 

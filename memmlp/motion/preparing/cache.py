@@ -5,8 +5,6 @@ the split and the array sizes depend on. The second pass writes the frames. The 
 cache without a manifest is unfinished, and the next call prepares it again.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -11,8 +11,6 @@ have copies in several parts. Then only the copies in one part stay: test has pr
 validation over training. So the test set stays as published, and training does not contain its motion. Copies
 within one part stay; statistics count their group once."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A split by person: training has no clips of the persons in validation or test."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass

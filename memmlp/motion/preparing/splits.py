@@ -9,8 +9,6 @@ and name. So an additional clip changes the parts of few other clips. A smaller 
 subset of the clips of a larger one.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections import Counter, defaultdict

@@ -1,7 +1,5 @@
 """Reads every npz file of a folder, and finds bad, unusual and duplicate clips."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The synthetic dataset: seeded procedural motion of a plausible person, written as AMASS files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

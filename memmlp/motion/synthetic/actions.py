@@ -3,8 +3,6 @@
 Each public function draws a random performance at the times t (N,), in seconds.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

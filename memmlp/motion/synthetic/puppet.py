@@ -5,8 +5,6 @@ angles lean forward, turn left, and lean to the right. Curves are arrays (N,) ov
 seconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Differences of a table's variants from their controls, with intervals and verdicts."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import statistics

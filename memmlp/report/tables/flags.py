@@ -1,7 +1,5 @@
 """Flags: warnings about the runs behind a table, in one line each."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

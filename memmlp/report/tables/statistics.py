@@ -18,8 +18,6 @@ A + B - E estimates the variance of the mean, because both A and B contain the n
 size, B is biased: too large if clips differ more than groups, too small if larger groups have larger effects.
 """
 
-from __future__ import annotations
-
 import bisect
 import functools
 import itertools
@@ -216,14 +214,6 @@ def estimate_interval(values: np.ndarray, groups: Groups = None) -> tuple[np.nda
     undefined = known.unreplicated == "seeds and clips"
     half = np.full_like(mean, np.nan) if undefined else known.compute_half_width(LEVEL)
     return mean - half, mean + half
-
-
-def estimate_seed_effects(differences: np.ndarray) -> EffectEstimates:
-    """Return effects from differences (K, S) of a quantity with one value per seed, such as a time."""
-    alone = differences[:, :, None]
-    effects, several = estimate_paired_effects(alone), differences.shape[1] > 1
-    p = estimate_error(alone).compute_significance_level(np.abs(effects.mean)) if several else effects.p
-    return effects._replace(p=p, unreplicated="" if several else "seeds")
 
 
 def compute_equivalence_p(

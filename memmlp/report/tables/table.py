@@ -1,7 +1,5 @@
 """The content of a table: rows of variants, cells of metrics, effects with verdicts."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Formats a table as Markdown, LaTeX, JSON or text for a terminal."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """Replays: a network's predictions for test clips, computed in the background."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """`memmlp report`: the page as one file, with selected sweeps, their runs, and all searches."""
 
-from __future__ import annotations
-
 import math
 import urllib.parse
 from collections.abc import Collection, Iterable, Mapping

@@ -1,7 +1,5 @@
 """The runs in an outputs folder, for the page's list. A run is read again when its files change."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import math

@@ -1,7 +1,5 @@
 """The server's answers about runs: rows of the run table, a run's page, and curves."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The server's answers about sweeps: progress, remaining time, and tables with effects and verdicts."""
 
-from __future__ import annotations
-
 import json
 import math
 import statistics

@@ -3,8 +3,6 @@
 The metrics log on disk is the queue between a run and its loggers. So the run never waits for a logger, and
 no data is lost if a logger is slow or fails. `memmlp loggers sync` adds missing data later."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import sys

@@ -39,7 +39,7 @@ PARAM_LENGTH, TAG_LENGTH, PARAMS, METRICS = 6000, 5000, 100, 1000  # MLflow's li
 @component("loggers", "mlflow", builds="MLflow")
 @dataclass
 class MLflowSettings(Settings):
-    """Shows runs in MLflow while they are in progress; `memmlp mlflow` opens its page.
+    """Shows runs in MLflow while they are in progress.
 
     It needs pip install 'memmlp[mlflow]'.
     """

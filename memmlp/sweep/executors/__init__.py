@@ -3,8 +3,6 @@
 Each worker chooses its runs itself (`memmlp.sweep.worker`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Protocol
 

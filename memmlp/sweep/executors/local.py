@@ -1,7 +1,5 @@
 """Workers that are processes of this machine, and the division of its GPUs among workers."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

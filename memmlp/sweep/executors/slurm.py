@@ -4,8 +4,6 @@ Whether a job is in the queue is read from `squeue`, since many clusters keep no
 its worker lives is read from the worker's heartbeat, since Slurm overlooks some dead steps for hours.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

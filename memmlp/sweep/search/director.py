@@ -4,8 +4,6 @@ A trial has a run for each seed. The first seed's run decides whether the trial 
 runs start after it.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence

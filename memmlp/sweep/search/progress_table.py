@@ -1,7 +1,5 @@
 """The live table of a search: the running trials, the best trials, and the number of trials in each state."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The results of a search: a CSV file of its trials, config files of the best trials, and plots."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings
@@ -16,7 +14,6 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.importance import PedAnovaImportanceEvaluator
 from optuna.trial import FrozenTrial, TrialState
 
-from memmlp.common.errors import import_optional
 from memmlp.common.files import atomic_write
 from memmlp.common.overrides import select_last_by_key
 from memmlp.common.schema import parse_config_yaml
@@ -190,36 +187,3 @@ def _find_range_end(value: Any, tried: BaseDistribution) -> str | None:
     if position >= 1 - margin:
         return "largest"
     return "smallest" if position <= margin and value else None
-
-
-def list_plots(study: Study) -> dict[str, dict[str, Any]]:
-    """Return the possible plots of a study: the keyword arguments for Optuna by the plot's name."""
-    names = [objective.text for objective in study.search.objectives]
-    if len(_list_complete_trials(study.study)) < 2:
-        return {}
-    if len(names) == 2:
-        first = {"target": _get_first_objective, "target_name": names[0]}
-        return {"pareto_front": {"target_names": names}, "parallel_coordinate": first, "slice": first}
-    titled = {"target_name": names[0]}
-    plots: dict[str, dict[str, Any]] = dict.fromkeys(
-        ("optimization_history", "parallel_coordinate", "slice"), titled
-    )
-    if compute_importances(study.study):
-        plots["param_importances"] = {**titled, "evaluator": _make_evaluator()}
-    return plots
-
-
-def write_plots(study: Study, path: Path) -> None:
-    """Write the plots into an offline HTML page. With fewer than two complete trials, nothing is written."""
-    import_optional("plotly", "plots", "the page of a search")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        figures = [
-            getattr(optuna.visualization, f"plot_{name}")(study.study, **keywords)
-            for name, keywords in list_plots(study).items()
-        ]
-    parts = [figure.to_html(full_html=False, include_plotlyjs=not n) for n, figure in enumerate(figures)]
-    title = f"search {study.search.name}: {len(study.trials)} trials"
-    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
-    if parts:
-        atomic_write(path, f"{head}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")

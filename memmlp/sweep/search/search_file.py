@@ -22,8 +22,6 @@ after: null                         # the folder of an earlier search; its best 
 storage: null                       # null: a journal in the search's folder; or a storage URL for Optuna
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

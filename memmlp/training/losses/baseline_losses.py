@@ -1,7 +1,5 @@
 """The baselines' losses, as in their released code, and an empty loss for networks with their own losses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar

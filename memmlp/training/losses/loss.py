@@ -1,7 +1,5 @@
 """The interface of losses: terms by name, and how they are weighted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import ClassVar

@@ -4,8 +4,6 @@ The paper's terms are implemented as printed: L1, summed over joints and compone
 batch (docs/readings.md, no. 10). All values are in world coordinates: rotations in 6D components, positions
 in metres, velocities per frame."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

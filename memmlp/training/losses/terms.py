@@ -1,8 +1,6 @@
 """A library of loss terms for any network (`TermsLoss`). All terms compare a predicted body with the true
 body in the world. Positions are in metres, velocities in metres per frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property, partialmethod
