@@ -1,11 +1,7 @@
 """Simulated differences have the documented variances; p keeps its level, and resampling tests do not."""
 
-import numpy as np
-import pytest
-
 from benchmarks import few_groups, verdicts
-from benchmarks.verdicts import Shares, Simulated, SimulationSetting
-from memmlp.report.tables.statistics import estimate_error
+from benchmarks.verdicts import SimulationSetting
 
 
 def test_p_keeps_its_level_and_resampling_does_not():
@@ -13,25 +9,6 @@ def test_p_keeps_its_level_and_resampling_does_not():
     errors = few_groups.simulate_resampling("skewed differences", 14, 1000, 0)
     assert few_groups.find_broken(errors.pop("flips"), 1000)
     assert not few_groups.find_broken(errors.pop("p")[:1], 1000)
-
-
-@pytest.mark.parametrize("cell", [SimulationSetting(5, 10, 1), SimulationSetting(5, 11, 2)])
-def test_mixed_effects_equal_simulated_differences(cell: SimulationSetting):
-    sample = Simulated(np.random.default_rng(3), cell, 24)
-    rng = np.random.default_rng(3)
-    of_seeds = np.sqrt(cell.seeds) * rng.normal(size=(24, cell.seeds))
-    fixed, noise, _ = verdicts.draw(rng, cell, 24)
-    shares = Shares(1, 2, 3, 4, 5)
-    weights = np.sqrt(np.array(shares) / 15)
-    by_group = weights[0] * of_seeds[:, :, None] + weights[4] * noise
-    by_group = by_group + np.einsum("i,kig->kg", weights[1:4], fixed)[:, None]
-    differences = by_group[:, :, cell.groups]
-    for seeds in (3, 5):
-        known, mean = sample.mixed(shares, seeds)
-        expected = estimate_error(differences[:, :seeds], cell.groups)
-        np.testing.assert_allclose(known.variances, expected.variances)
-        assert (known.seeds, known.groups) == (expected.seeds, expected.groups)
-        np.testing.assert_allclose(mean, differences[:, :seeds].mean((1, 2)))
 
 
 def test_a_cell_is_reproducible_and_broken_promises_are_listed():

@@ -5,7 +5,6 @@ import re
 import runpy
 import shlex
 import sys
-import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -14,18 +13,15 @@ from typing import Any, NamedTuple
 import click
 import pytest
 import yaml
-from omegaconf import OmegaConf
 from own_package import PACKAGE, registers_kept
 
-from memmlp.cli.main import COMMANDS, commands
+from memmlp.cli.main import commands
 from memmlp.cli.workers import Workers, split_executor
 from memmlp.common.components import list_component_names as component_names
-from memmlp.common.overrides import flatten
 from memmlp.config.build import build_untrained
 from memmlp.config.compose import compose_config, compose_jobs, compose_plain, parse_hydra_arguments
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.plugins import activate
-from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 from memmlp.sweep.search.search_file import parse_search
@@ -270,38 +266,10 @@ def anchors(path: Path) -> set[str]:
     return slugs | set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
 
 
-def test_extras_and_metrics_are_those_of_the_package():
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for page in PAGES:
-        for extra in re.findall(r"(?:memmlp|'\.)\[(\w+)\]", page.read_text(encoding="utf-8")):
-            assert extra in extras, f"{page}: {extra}"
-    text = (DOCS / "guides/runs.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `(.+?)` \| (.+?) \| (.+?) \|", text, re.MULTILINE)
-    listed = {name: (unit, float(smallest)) for name, unit, smallest in rows if name in UNITS}
-    assert listed == {name: (UNITS[name], SMALLEST[name]) for name in UNITS if name != "GT Jitter"}
-
-
 @pytest.fixture
 def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(DOCS)
     return importlib.import_module("reference")
-
-
-@pytest.mark.slow
-def test_the_reference_has_every_key_and_option(reference: ModuleType):
-    page = reference.make_config_page()
-    memories = [f"memory={name}" for name in component_names("memory")]
-    for word in (*memories, "model=agrol_diffusion", "model=avatar_poser", "loss=manual", "rollout=streams"):
-        values = flatten(OmegaConf.to_container(compose_config([word]), resolve=False)).items()
-        for key in {key for key, value in values if f"## {key}\n" not in page or value not in (None, {})}:
-            assert key.rsplit(".", 1)[-1] == "name" or key == "imported_weights" or f"| `{key}` |" in page, (
-                f"{word}: {key}"
-            )
-    page = reference.make_command_page()
-    for name in COMMANDS:
-        assert f"## memmlp {name}\n" in page
-    for option in ("--until-decided", "--udp PORT", "--save-predictions PATH"):
-        assert f"| `{option}` |" in page, option
 
 
 @pytest.mark.slow

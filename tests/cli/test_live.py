@@ -58,15 +58,6 @@ def step(step_files) -> Path:
     return step_files("no_memory")
 
 
-def test_python_osc_is_needed_only_by_the_options_that_use_it(memmlp, monkeypatch, step: Path):
-    monkeypatch.setitem(sys.modules, "pythonosc", None)
-    line = ["live", str(step), "--no-browser"]
-    udp = ["--udp", "9001"]
-    assert one_line(memmlp(*line, *udp, "--token", "a token of many letters"), "--token: ")  # the last check
-    for needing in (["--osc", "9001"], [*udp, "--vmc", "127.0.0.1"]):
-        assert one_line(memmlp(*line, *needing), f"{needing[-2]}: needs python-osc")
-
-
 def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_path: Path):
     """As in `memmlp predict`: trackers of another body would be those of another person than it learned."""
     model = onnx.load(step)

@@ -11,10 +11,8 @@ import pytest
 from conftest import Memmlp, one_line
 from processes import finished
 
-import memmlp as package
 from memmlp.cli.main import COMMANDS, main
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.common.files import find_packaged_folder
 
 
 def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -128,11 +126,3 @@ def test_completion(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setenv("COMP_LINE", line)
         ran = memmlp("-sc", "query=bash")
         assert (ran.code, set(ran.out.split())) == (0, expected), line
-
-
-@pytest.mark.parametrize("installed", [True, False])
-def test_the_configs_are_found_beside_the_package_or_in_it(tmp_path: Path, monkeypatch, installed: bool):
-    place = tmp_path / "memmlp" / "_conf" if installed else tmp_path / "conf"
-    place.mkdir(parents=True)
-    monkeypatch.setattr(package, "__file__", str(tmp_path / "memmlp" / "__init__.py"))
-    assert find_packaged_folder("conf") == place

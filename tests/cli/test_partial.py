@@ -1,6 +1,5 @@
 """A protocol whose list isn't all there: refused, or said wherever its runs are shown."""
 
-import contextlib
 import json
 from pathlib import Path
 
@@ -10,8 +9,6 @@ import yaml
 from cli.conftest import write_random_clip
 from command_line import run
 
-from memmlp.config.build_request import build_motion
-from memmlp.config.compose import compose_config
 from memmlp.runs.lookup import list_runs
 
 TINY = [
@@ -48,18 +45,6 @@ def test_a_missing_clip_stops_whatever_trains_with_one_line(home, command):
     said = run(home, *command, *S1, code=2)
     assert said.startswith(f"memmlp: {REFUSED}; data.partial=true")
     assert not list_runs(home / "outputs")
-
-
-def test_a_plan_that_was_made_for_a_look_is_no_way_round(home):
-    with contextlib.chdir(home):
-        build_motion(compose_config([*S1, "data.split.val=0.2", "data.partial=true"])).prepare()
-    words = ["sweep", "s1.yaml", *TINY, *S1]
-    assert "prepared" not in run(home, *words, "--status")  # the plan is kept
-    assert REFUSED in run(home, *words, "--workers", "1", code=2)
-    words = ("data=amass_s1", "data.split.folder=lists", "data.split.val=0.2")
-    said = run(home, "data", "prepare", "amass", *words, "--out", "cache")
-    assert "87 % of the list (7 of 8 entries): 1 of 8 entries" in " ".join(said.split())
-    assert "87 % of the list" in run(home, "data", "inspect", "cache")
 
 
 @pytest.mark.slow

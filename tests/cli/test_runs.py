@@ -1,6 +1,5 @@
 """`memmlp runs` on folders made by hand."""
 
-import json
 import re
 from pathlib import Path
 
@@ -75,28 +74,6 @@ def test_diff(memmlp: Memmlp, outputs: Path):
     assert "can be chance" in ran.out
     assert memmlp("runs", "diff", "a", "a").out == "config: no difference\nresults: no difference\n"
     assert one_line(memmlp("runs", "diff", "a", "zz"), "run 'zz'")
-
-
-def test_diff_names_component_versions_and_devices_and_leaves_out_what_changes_no_result(memmlp, outputs):
-    facts = (
-        (A, "vq", "fast", {"component_versions": {"features": 1, "memory.vq": 1}, "device": "cpu"}),
-        (B, "none", "slow", {"component_versions": {"features": 2}, "device": "cuda"}),
-    )
-    for name, memory, cpu, manifest in facts:
-        run, config = Run.from_id(outputs, name), {"memory": {"name": memory}, "threads": len(memory)}
-        run.begin("memmlp", config, data="d" * 64, prerequisite=None)
-        run.write_manifest(manifest)
-        latency = {"median_ms": 1.0, "made": f"on {cpu}", "settings": {"steps": len(memory)}}
-        path = run.deployment("fp32-0").latency
-        path.parent.mkdir(parents=True)
-        path.write_text(json.dumps(latency | {"made_by": {"cpu": cpu}}))
-    ran = memmlp("runs", "diff", A, B)
-    for row in (
-        ["memory", "vq", "none"], ["component_versions.features", "1", "2"], ["device", "cpu", "cuda"],
-        ["latency", "fast", "slow"],
-    ):  # fmt: skip
-        assert row in rows(ran), row
-    assert not re.search(r"threads|on fast|settings|memory\.vq", ran.out)
 
 
 def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):

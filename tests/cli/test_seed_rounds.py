@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 from conftest import Memmlp, one_line
-from fake_runs import CLIPS, fake_run
+from fake_runs import fake_run
 
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep
@@ -147,20 +147,6 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
     runs.version = ""
     Path("outputs/sweeps/trial/rounds.json").write_text("{")
     assert one_line(memmlp(*SWEEP), "rounds.json: damaged")
-
-
-def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monkeypatch: pytest.MonkeyPatch):
-    with monkeypatch.context() as patch:
-        patch.setitem(FACTORS, "same", float("nan"))
-        out = memmlp(*SWEEP).out
-    assert "there is nothing to compare: same" in out
-    assert "all verdicts are decided" not in out
-    runs.version, runs.groups = "second version", dict.fromkeys(CLIPS, "one take")
-    Path("outputs/sweeps/trial/rounds.json").unlink()
-    runs.made.clear()
-    out = memmlp(*SWEEP).out
-    assert len(runs.made) == 9
-    assert "all test clips form one group" in out
 
 
 @pytest.mark.slow

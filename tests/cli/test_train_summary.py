@@ -1,36 +1,14 @@
 """What `memmlp train` says of a network's size and times."""
 
-import json
 from pathlib import Path
 
 import pytest
 from fake_runs import fake_run
 
-from memmlp.cli.train_summary import describe_latency, make_all_metrics_tables, show
-from memmlp.runs.evaluation_file import write_report
+from memmlp.cli.train_summary import describe_latency, show
 from memmlp.training.request import Outcome
 
 MEASURED = {"parameters": 19_238, "parameters_with_vqvae": 27_050, "macs": 218_048, "onnx_bytes": 995_047}
-
-
-def test_tables_of_sources_are_of_the_evaluation_that_is_shown(tmp_path: Path):
-    """A run was evaluated twice, the second time with three times the errors."""
-    run = fake_run(tmp_path, "a", branches=("rotation",))
-    report = json.loads(run.evaluation("stream-0").read_text())
-    for clip in report["clips"]:
-        clip["source"] = clip["name"].split("/")[0]
-    write_report(run.evaluation("stream-0"), report)
-    for clip in report["clips"]:
-        clip["rotation"] = {metric: 3 * value for metric, value in clip["rotation"].items()}
-    write_report(run.evaluation("stream-1"), report)
-
-    def first(stage: str) -> list[float]:
-        _, *tables = make_all_metrics_tables(run, {}, [stage])
-        return [float(next(iter(table.columns[2].cells))) for table in tables]
-
-    assert len(first("stream-0")) == 2
-    for once, thrice in zip(first("stream-0"), first("stream-1"), strict=True):
-        assert abs(thrice - 3 * once) < 0.03
 
 
 @pytest.mark.parametrize(("steps", "told"), [(2000, False), (20, True)])

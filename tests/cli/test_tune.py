@@ -130,17 +130,6 @@ def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytes
     assert len(study.trials) == 1
 
 
-def test_a_folder_of_ones_own_searches(tmp_path: Path):
-    (tmp_path / "own/search").mkdir(parents=True)
-    space = "space: {loss: null, optim: {warmup: {low: 0, high: 3}}}"
-    text = f"defaults: [loss_weights, _self_]\nname: rates\nbase: []\n{space}\n"
-    (tmp_path / "own/search/rates.yaml").write_text(text)
-    data = "+search.space.data.split.train_fraction={low: 0.5, high: 1.0}"
-    setup = prepare_search([*TINY, "search=rates", data], tmp_path / "own", tmp_path)
-    assert [one.key for one in setup.search.space] == ["optim.warmup", "data.split.train_fraction"]
-    assert setup.folder.name.startswith("rates-")
-
-
 def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
     outputs = tmp_path / "outputs"
     shutil.copytree(home / "outputs", outputs)

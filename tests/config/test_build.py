@@ -5,53 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-import tiny
-import torch
 from omegaconf import OmegaConf
 
 from memmlp.config.build import build_experiment, make_readable_name
 from memmlp.config.compose import compose_config
-from memmlp.deploy.export import export
-from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
-from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.mem_mlp import MemMLP
 from memmlp.training.run_stages import Experiment
 
 TINY = [
     "profile=tiny", "data.synth.minutes=0.1", "loggers=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
     "optim.batch=4", "model.width=8", "memory.width=4", "vqvae.width=8", "evaluation.ik_iterations=2",
 ]  # fmt: skip
-SMALL = ["model.frames=5", "model.depth=2", "memory.layers=[2]", "predictor.depth=1"]  # unless an axis
-
-
-EXPORTED = [
-    ["memory=vq_joint", "memory.blend=sampled", "memory.shift=frame", "memory.history=latest",
-     "predictor=two_branch_memory", "normalizer.coordinates=heading"],
-    ["memory=gru", "predictor=rotation_only_memory", "hand=fk", "normalizer.coordinates=head_relative"],
-    ["memory=no_codes", "memory.fusion=plain", "predictor=rotation_only", "hand=off",
-     "normalizer.coordinates=world"],
-]  # fmt: skip
-"""Values that make another graph; other memories' graphs are in tests/exported.py."""
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("overrides", EXPORTED, ids=" ".join)
-def test_every_kind_of_graph_exports(overrides, tmp_path):
-    model = network([*TINY, *SMALL, "vqvae.encoder_depth=1", "vqvae.decoder_depth=1", *overrides])
-    export(model, tmp_path / "step.onnx", "0" * 16)
-    clip = torch.randn(12, 252, generator=torch.Generator().manual_seed(0))
-    assert measure_largest_difference(model, tmp_path / "step.onnx", clip) <= TOLERANCE
-
-
-def network(overrides: list[str]) -> MemMLP:
-    torch.manual_seed(0)
-    architecture = build_experiment(compose_config(overrides)).architecture
-    codes = architecture.vqvae() if architecture.uses_codes else None
-    model = architecture.build(Normalizer.from_coordinates(architecture.coordinates, tiny.REST), codes)
-    for name, buffer in model.named_buffers():
-        if name.endswith("codebook.vectors"):
-            buffer.normal_()
-    return model.eval()
 
 
 @pytest.mark.slow

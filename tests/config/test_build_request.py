@@ -60,15 +60,6 @@ def test_named_sources_have_fractions_of_their_own():
         build_motion(mix(with_source(val=0.95)))
 
 
-def test_a_fraction_that_each_source_has_itself_is_refused():
-    shares = {"cmu": 0.3, "bandai": 0.0}  # none is a share of its own, too
-    both = {"sources": {name: {**one, "test": shares[name]} for name, one in MIX["sources"].items()}}
-    with pytest.raises(InputError, match=r"^data\.split\.test=0\.5: each source sets its own value"):
-        mix(both, "data.split.test=0.5")
-    assert mix(both, "data.split.val=0.2").data.split.val == 0.2
-    assert mix(with_source(test=0.3), "data.split.test=0.5").data.split.test == 0.5  # which is bandai's
-
-
 def test_named_sources_have_groups_of_their_own():
     split = build_motion(mix(None, "data.split.val=0.2")).clips.split
     assert split.splits["cmu"].groups[0] == "salsa/(?:01|16)$"

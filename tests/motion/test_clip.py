@@ -70,16 +70,6 @@ def test_recorded_frames_stay(interpolation):
     np.testing.assert_allclose(clip.trans[::2], recorded.trans, atol=1e-9)
 
 
-def test_few_frames_and_jumps_are_interpolated_too():
-    """A glitch of half a turn in one frame makes no rotation that is no number."""
-    for frames in (2, 3, 4, 31):
-        poses, trans = swinging(np.arange(frames) / 30)
-        poses[15:16, 0] = [np.pi, 0, 0]
-        clip, _ = resample(Clip("a", poses, trans, 30.0))
-        assert len(clip) == 2 * frames - 1
-        assert np.isfinite(clip.poses).all()
-
-
 def test_pieces_are_the_clip():
     poses, trans = analytic(np.arange(7.0))
     for frames, lengths in ((3, [3, 3, 1]), (7, [7]), (100, [7])):

@@ -79,25 +79,6 @@ def test_a_missing_subset_is_said_and_a_seeded_split_has_no_list(root):
         assert source(root, split).prepare().manifest.coverage.is_complete
 
 
-def test_a_column_file_has_a_cache_of_its_own_and_names_the_groups(root):
-    file = root.with_name("groups.csv")
-
-    def prepared(last: str):
-        rows = [f"{name}_stageii,{name.split('/')[0]}" for name in NAMES]
-        file.write_text("\n".join(["clip,group", *rows[:-1], f"{NAMES[-1]}_stageii,{last}"]))
-        return source(root, SeededSplit(test=0.3, val=0.3, groups_file=file)).prepare()
-
-    found = prepared("third")
-    assert set(found.manifest.groups.values()) == {"CMU", "HDM05", "third"}
-    assert len({(clip.group, clip.split) for clip in found.manifest.clips}) == 3
-    assert prepared("fourth").cache != found.cache
-    (root / f"{NAMES[0]}_stageii.npz").write_bytes(b"PK broken")
-    prepared("third")  # a row for a clip that can't be used is none for an unknown one
-    (root / f"{NAMES[0]}_stageii.npz").unlink()
-    with pytest.raises(InputError, match="CMU/01/take_stageii"):
-        prepared("third")
-
-
 def test_nothing_goes_on_with_clips_that_are_others_by_now(root):
     """What was trained on one set of clips would be tested on another, under the first one's digest."""
     changing = source(root, SeededSplit(test=0.2, val=0.2))

@@ -91,18 +91,6 @@ def test_prerequisites_of_prerequisites_are_known(tmp_path: Path):
     assert collect_prerequisite_versions(network.manifest) == {"vqvae": 1, "model.mem_mlp": 2}
 
 
-def test_a_training_that_is_resumed_upon_other_weights_has_both(tmp_path: Path):
-    network = Run.from_id(tmp_path, NETWORK)
-    for weights in ("first", "first", "others"):
-        codes = trained(tmp_path, CODES, weights=weights)
-        above = list_prerequisite_origins(codes.manifest, codes.weights_digest)
-        network.begin("memmlp", {}, data="d", prerequisite=CODES, prerequisite_runs=above)
-        network.checkpoint.touch()
-    found = [one["weights"] for one in network.manifest["prerequisite_runs"]]
-    assert len(found) == 2
-    assert found[0] == codes.weights_digest != found[1]
-
-
 def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     run = Run.from_id(tmp_path, "0" * 16)
 

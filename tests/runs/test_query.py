@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.runs.lookup import add_tags
-from memmlp.runs.query import build_record, label_data, list_differing_keys, parse_query
+from memmlp.runs.query import build_record, list_differing_keys, parse_query
 
 ONE = {
     "memory": "gru", "seed": 1, "optim.lr": 1e-3, "memory.layers": [2, 4], "stream.MPJPE": 6.25,
@@ -123,20 +123,3 @@ def test_the_data_differs_where_its_digest_does_and_is_told_apart_by_its_name():
     configs: list[dict[str, Any]] = [{"seed": i, "data": one} for i, one in enumerate(data)]
     assert list_differing_keys(configs[:2], "de") == ["seed"]
     assert list_differing_keys(configs, "def") == ["seed", "data.root"]
-
-
-def test_data_have_a_digest_only_where_two_have_one_name(tmp_path: Path):
-    def one(digest: str, config: dict[str, Any]) -> dict[str, Any]:
-        run = begun(tmp_path / digest / str(len(config)), config)
-        run.write_manifest({"data": digest})
-        return build_record(run)
-
-    synth, mocap, other = (
-        one(digit * 64, {"data": {"name": name}})
-        for digit, name in [("a", "synth"), ("b", "mocap"), ("c", "mocap")]
-    )
-    vqvae, unknown = one("a" * 64, {}), one("d" * 64, {})
-    assert label_data([synth, vqvae, mocap]) == ["synth", "synth", "mocap"]
-    assert label_data([synth, mocap, other]) == ["synth", "mocap bbbbbbbb", "mocap cccccccc"]
-    assert label_data([unknown]) == ["dddddddd"]
-    assert parse_query("data=synth").match_records([synth, mocap]) == [True, False]

@@ -104,11 +104,3 @@ def test_eval_shows_the_card_and_measures_only_with_data(memmlp, tmp_path: Path)
     again = memmlp("eval", "recurrent_poser", "--again", "--outputs", str(tmp_path))
     assert again.code == 2
     assert "data.root" in again.err
-
-
-def test_the_list_and_the_cards(memmlp):
-    listed, card = memmlp("models"), memmlp("models", NAMES[0])
-    assert all(name in listed.out for name in NAMES)
-    assert read_card(NAMES[0])["commit"][:8] in card.out
-    assert memmlp("models", "--markdown").out.count("\n## ") + 1 == len(NAMES)
-    assert memmlp("models", "none").code == 2

@@ -1,15 +1,11 @@
 """The controller: a fleet replaces what dies, is no larger than the work, and says why nothing lives."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.sweep import controller
 from memmlp.sweep.controller import MAX_FAILED_STARTS, Fleet
-from memmlp.sweep.plan import Plan, RunTask
-from memmlp.sweep.progress_table import Board
 
 
 class Dead:
@@ -67,25 +63,6 @@ def test_a_fleet_replaces_the_dead_and_is_no_larger_than_the_work(tmp_path: Path
     assert shelf.batches == [2, 1, 1]  # those that start at once are started together
     fleet.cancel()
     assert not any(handle.alive() for handle in shelf.handles)
-
-
-def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(controller, "READ_INTERVAL", 0)
-    task = RunTask("1" * 16, "memmlp", {})
-    plan = Plan("trial", tmp_path, (), (task,))
-    told: list[str] = []
-
-    class Looks(Board):
-        """The run fails between the second look and the question what is left."""
-
-        def update(self, plan: Plan, states: Mapping[str, str]) -> None:
-            told.append(states[task.key])
-            if len(told) == 2:
-                plan.get_run(task).folder.mkdir(parents=True)
-                plan.get_run(task).fail("the loss is nan")
-
-    controller.complete_plan(plan, Fleet(Shelf(Living), lambda: None, 1, tmp_path), Looks())
-    assert told == ["new", "new", "failed"]
 
 
 @pytest.mark.parametrize(("kind", "line"), [(Dead, "the reason"), (Unfit, Unfit.said)])

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.definition import SWEEP_FILE as NAME
 from memmlp.sweep.definition import load_sweep_copy, save_sweep_copy
 from memmlp.sweep.sweep_file import parse_sweep
 
@@ -102,10 +101,3 @@ def test_what_is_read_is_what_was_kept(tmp_path: Path):
     for each in (sweep, changed):
         save_sweep_copy(each, tmp_path)
         assert load_sweep_copy(tmp_path) == each
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"variants": [{"no": 1}]}'])
-def test_a_damaged_copy_is_named(tmp_path: Path, text: str):
-    (tmp_path / NAME).write_text(text)
-    with pytest.raises(InputError, match=f"{NAME}: must be a sweep"):
-        load_sweep_copy(tmp_path)

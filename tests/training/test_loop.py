@@ -155,14 +155,6 @@ def test_a_resumed_training_keeps_the_same_weights(tmp_path):
     assert_kept(task, Run(tmp_path), snapshots)
 
 
-def test_without_a_branch_the_last_weights_are_kept(tmp_path):
-    snapshots: dict = {}
-    task, run = task_with_errors(snapshots), Run(tmp_path)
-    train(task, replace(BEST, best_by=None), run, 0, "it")
-    assert run.kept_validation.step == 8
-    assert all(torch.equal(one, snapshots[8][name]) for name, one in task.model.state_dict().items())
-
-
 def test_a_branch_that_is_not_validated_is_refused(tmp_path):
     with pytest.raises(InputError, match="best_by: 'position MPJPE' is not validated"):
         train(task_with_errors({}), replace(BEST, best_by="position"), Run(tmp_path), 0, "it")

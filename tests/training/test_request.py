@@ -45,16 +45,6 @@ def test_single_groups_and_divided_persons_are_facts_of_the_run():
     assert warnings(clips, split={"kind": "lists"})["divided"] is None
 
 
-def test_clips_that_were_recorded_at_a_lower_rate_are_said():
-    rates = {"a": 30.0, "b": 30.0, "c": 60.0, "d": 59.94, "e": 120.0, "f": 100.0}
-    clips = [*(clip(name, "test", fps) for name, fps in rates.items()), clip("g", "train", 25.0)]
-    lines, splines = SimpleNamespace(interpolation="lines"), SimpleNamespace(interpolation="splines")
-    assert "3 of 7 clips were recorded at 25 to 30" in request.describe_low_rates(lines, clips, "clips")
-    assert request.describe_low_rates(lines, clips[2:6], "clips") is None
-    assert request.describe_low_rates(splines, clips, "clips") is None
-    assert "2 of 6 test clips were" in warnings(clips, interpolation="lines")["resampled"]
-
-
 def test_a_part_of_the_data_or_of_a_protocol_is_told():
     """A protocol with a part of its training clips is not the protocol, and says so."""
     for whole, fraction, words in (

@@ -133,19 +133,6 @@ def test_another_height_forgets_the_calibration(worn: Wearing):
     assert (saved.offsets, saved.height) == (None, 1.90)
 
 
-def test_forgotten_and_cancelled(worn: Wearing):
-    worn.order("calibrate", 0)
-    worn.fitting.step(worn.pose())
-    worn.order("forget")
-    worn.order("calibrate")
-    worn.order("cancel")
-    worn.now += 100
-    worn.fitting.step(worn.pose())
-    assert worn.stream.offsets is None
-    assert read_calibration(worn.path, "amass", worn.stream.network.body).offsets is None
-    assert (worn.states[-1]["waiting"], worn.states[-1]["calibrated"]) == (None, False)
-
-
 class Instant(ClipSource):
     """A clip that is played without waiting, by a clock of its own; at its end it stops the loop."""
 

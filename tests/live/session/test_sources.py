@@ -146,15 +146,6 @@ def test_samples_are_the_clips_frames_or_between_them(clip: TrackedClip):
     np.testing.assert_allclose(clip.interpolate_joints(10.5 / 60), clip.joints[10:12].mean(0), atol=1e-9)
 
 
-def test_what_is_due_while_somebody_works_is_dropped(clip: TrackedClip):
-    clock = Clock()
-    played = source(clip, 60, clock)
-    played.read()
-    clock.sleep(3.5 / 60)
-    sample = played.read()
-    assert (sample.dropped, sample.time, played.read().dropped) == (2, pytest.approx(3 / 60), 0)
-
-
 @pytest.mark.parametrize("hz", [50.0, 60.0, 72.0, 90.0, 120.0])
 def test_rounds_follow_after_pauses_with_the_truth_of_the_first(clip: TrackedClip, hz: float):
     """A round's beginning is a multiple of its length but for rounding, and may lie before it."""

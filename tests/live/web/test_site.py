@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -64,30 +62,6 @@ def test_without_the_packages_an_earlier_site_stays(tmp_path: Path, monkeypatch:
         NOTHING.write(tmp_path / "site")
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
     assert [path.name for path in (tmp_path / "site").iterdir()] == ["site.json"]
-
-
-def test_a_new_version_keeps_other_sites_below_its_address(node: str, tmp_path: Path):
-    """They stay offline; what is deleted are the site's own earlier versions."""
-    worker = resources.files("memmlp.live.web").joinpath("page", "sw.js")
-    (tmp_path / "sw.js").write_bytes(worker.read_bytes())
-    (tmp_path / "package.json").write_text('{"type": "module"}')
-    places = ("one/ old", "one/ new", "one/two/ old", "three/ old")
-    kept = [f"memmlp https://a.org/{place}" for place in places]
-    script = f"""
-      const [heard, deleted] = [{{}}, []];
-      Object.assign(globalThis, {{
-        VERSION: 'new', FILES: [], clients: {{ claim() {{}} }},
-        registration: {{ scope: 'https://a.org/one/' }},
-        caches: {{ keys: async () => {json.dumps(kept)}, delete: async name => deleted.push(name) }},
-        addEventListener(kind, listener) {{ heard[kind] = listener; }},
-      }});
-      await import('./sw.js');
-      await new Promise(resolve => heard.activate({{ waitUntil: done => done.then(resolve) }}));
-      console.log(JSON.stringify(deleted));
-    """
-    command = [node, "--input-type=module", "-e", script]
-    said = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=60).stdout
-    assert json.loads(said) == kept[:1]
 
 
 def test_it_is_the_middle_of_the_clip_in_the_page_s_axes():

@@ -173,17 +173,6 @@ def test_joints_are_where_plain_kinematics_puts_them(tmp_path: Path):
         np.testing.assert_allclose(recording.compute_zero_pose()[node], zero[name][0], atol=1e-9)
 
 
-def test_a_pose_has_the_given_angles(tmp_path: Path):
-    values = np.zeros((1, 62))
-    values[0, COLUMNS.index(("lhumerus", "ry"))] = 35.0
-    recording = read_amc(write_take(tmp_path / "05", values))
-    posed, frames = recording.compute_pose({"lhumerus": [0.0, 35.0, 0.0]}), recording.compute_kinematics()
-    for one, other in zip(posed, frames, strict=True):
-        assert np.allclose(one, other[0])
-    with pytest.raises(InputError, match=r"rest\.lhumerus has 1 values; must have 3"):
-        recording.compute_pose({"lhumerus": [35.0]})
-
-
 def test_cut_starts_line_ends_and_the_order_of_bones_do_not_matter(tmp_path: Path):
     values = movement(3)
     plain = read_amc(write_take(tmp_path / "05", values))

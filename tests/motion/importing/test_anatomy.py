@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import JOINTS, make_builtin_rest_joints
 from memmlp.motion.importing import anatomy
-from memmlp.motion.importing.anatomy import HINGES, LIMBS
 
 REST = make_builtin_rest_joints()
 ALL = np.ones(len(JOINTS), bool)
@@ -90,17 +89,3 @@ def test_every_segment_points_as_in_the_stance(mapped: np.ndarray) -> None:
         if start > 0:
             there = stance[end] - stance[start]
             assert anatomy.compute_angles(own[start] @ (REST[end] - REST[start]), there) < 1e-6
-
-
-def test_bends_and_hinges() -> None:
-    """Knees and elbows of the body bend about `HINGES`, seen in one pose or in a motion."""
-    for joint, axis in HINGES.items():
-        middle, upper, positions = LIMBS[joint], np.tile(np.eye(3), (3, 1, 1)), np.tile(REST, (3, 1, 1))
-        bends = Rotation.from_rotvec(np.radians([[20.0], [50.0], [70.0]]) * axis).as_matrix()
-        straight = REST[middle] - REST[joint]
-        positions[:, LIMBS[middle]] = positions[:, middle] + 0.3 * bends @ straight
-        found = anatomy.find_hinge_axis(upper, positions, joint), anatomy.find_bend_axis(positions[2], joint)
-        assert all(anatomy.compute_angles(own, np.array(axis)) < 15 for own in found)
-        positions[:, LIMBS[middle]] = positions[:, middle] + straight
-        assert anatomy.find_hinge_axis(upper, positions, joint) is None
-        assert anatomy.find_bend_axis(positions[2], joint) is None

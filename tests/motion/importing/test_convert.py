@@ -207,7 +207,6 @@ def test_a_performance_comes_back_from_its_file(tmp_path: Path) -> None:
     assert np.degrees(angles.max()) < 0.01
 
 
-BANDAI = load_skeleton("bandai_namco")
 ARM = ("collar", "shoulder", "elbow", "wrist")
 LEG = ("hip", "knee", "ankle", "foot")
 
@@ -252,17 +251,6 @@ def test_a_frame_of_the_file_serves_as_rest(tmp_path: Path, walk: Clip) -> None:
         found(tmp_path, lying(walk), replace(DAZ, rest=3))
 
 
-def test_who_never_stands_and_a_wrong_up_axis_are_refused(tmp_path: Path, walk: Clip) -> None:
-    turns = random_turns(own_tree(DAZ), 1)
-    with refuse(tmp_path / "clip.bvh", "stands neither in the zero pose (", "nor in a frame (best: "):
-        found(tmp_path, lying(walk), DAZ, turns=turns)
-    assert found(tmp_path, lying(walk), DAZ).source == "the zero pose"
-    with refuse(tmp_path / "clip.bvh", "degrees away from up"):
-        found(tmp_path, walk, replace(DAZ, up="z"))
-    with refuse(tmp_path / "clip.bvh", "degrees away from up"):
-        found(tmp_path, walk, DAZ, written=replace(DAZ, up="z"))
-
-
 def swapped(chosen: SkeletonMap, parts: tuple[str, ...]) -> SkeletonMap:
     """The map with the left ones of some joints for the right ones."""
     other = {"left": "right", "right": "left"}
@@ -284,26 +272,3 @@ def test_swapped_sides_are_refused(tmp_path: Path, walk: Clip) -> None:
     turns = random_turns(own_tree(DAZ), 1)
     with refuse(tmp_path / "clip.bvh", "bends forward, so left and right"):
         found(tmp_path, walk, swapped(DAZ, LEG), turns=turns)
-
-
-def leaning(degrees: float) -> list[float]:
-    """The spine's rotation values in the map's rest, leaning forward."""
-    assert BANDAI.rest is not None
-    hips, spine = (Rotation.from_euler("ZXY", BANDAI.rest[name], degrees=True) for name in ("Hips", "Spine"))
-    lean = Rotation.from_euler("x", degrees, degrees=True)
-    return (hips.inv() * lean * hips * spine).as_euler("ZXY", degrees=True).tolist()
-
-
-@pytest.mark.parametrize(("change", "said"), [
-    ({"Spine": leaning(80.0)}, "pelvis to head points 7"),
-    ({"Spine": [90.0, 86.2]}, "rest.Spine has 2 values"),
-])  # fmt: skip
-def test_a_folded_pose_of_a_map_is_refused(
-    tmp_path: Path, walk: Clip, change: dict[str, list[float]], said: str
-) -> None:
-    """Bones along their parents' X axes, as the data's are, in the map's rest but for one joint."""
-    assert BANDAI.rest is not None
-    turns = rest_turns(BANDAI, own_tree(BANDAI))
-    chosen = replace(BANDAI, rest={**BANDAI.rest, **change})
-    with refuse(tmp_path / "clip.bvh", said):
-        found(tmp_path, walk, chosen, BANDAI, turns)

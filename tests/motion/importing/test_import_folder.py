@@ -161,18 +161,6 @@ def test_each_clip_is_put_on_its_floor(walks: Path, tmp_path: Path) -> None:
     assert np.diff(found) == pytest.approx([0.2, 0.4], abs=0.01)
 
 
-def test_floors_as_told(walks: Path, tmp_path: Path) -> None:
-    left = import_folder(walks, tmp_path / "left", ImportSettings(floor=NONE))
-    told = import_folder(walks, tmp_path / "told", ImportSettings(floor=0.3))
-    assert [clip.floor for clip in left.clips] == [None] * 3
-    scale = {clip.floor for clip in told.clips}
-    assert len(scale) == 1
-    taken = np.subtract(toes(tmp_path / "left"), toes(tmp_path / "told"))
-    np.testing.assert_allclose(taken, scale.pop(), atol=1e-5)
-    zero = import_folder(walks, tmp_path / "zero", ImportSettings(floor=0))
-    assert [clip.floor for clip in zero.clips] == [0.0] * 3
-
-
 def test_clips_with_faults_are_left_out_where_only_sound_ones_are_wanted(tmp_path: Path) -> None:
     write(tmp_path / "in", performed(DAZ, WALK).text(), "sound.bvh")
     write(tmp_path / "in", performed(DAZ, replace(WALK, trans=3 * WALK.trans)).text(), "sliding.bvh")

@@ -19,8 +19,7 @@ from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.importing.import_folder import import_folder
 from memmlp.motion.preparing import duplicates
 from memmlp.motion.preparing import survey as survey_module
-from memmlp.motion.preparing.cache import ClipFolder, prepare_cache
-from memmlp.motion.preparing.duplicates import BONES, assign_parts
+from memmlp.motion.preparing.duplicates import assign_parts
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 from memmlp.motion.preparing.splits import Assignment, MixedSplit, SeededSplit
 from memmlp.motion.preparing.survey import survey_folder
@@ -175,15 +174,6 @@ def test_repetitions_cuts_and_common_rest_poses_are_different(root: Path):
     assert survey_folder(root).duplicates == {}
 
 
-def test_copies_are_drawn_together(root: Path, tmp_path: Path):
-    write_all(root, lambda clip: cut(clip, 60))
-    manifest = prepare_cache(ClipFolder(root, SeededSplit(test=0.3, val=0.3)), tmp_path / "cache")
-    parts = {clip.name: clip.split for clip in manifest.clips}
-    assert set(parts.values()) == {"train", "val", "test"}
-    assert all(parts[f"a/{activity}"] == parts[f"b/{activity}"] for activity in ACTIVITIES)
-    assert len({clip.group for clip in manifest.clips}) == len(ACTIVITIES)
-
-
 def convert(clip: Clip, seed: int) -> Clip:
     """Turn every joint by a constant of about 10 degrees, and change the size, as other bones do."""
     turns = Rotation.from_rotvec(np.random.default_rng(seed).normal(0, 0.1, (22, 3))).as_matrix()
@@ -203,15 +193,6 @@ def test_conversions_are_copies_and_repetitions_are_not(tmp_path: Path, activity
     write_clip(tmp_path / "late.npz", resample(late, 30.0)[0])
     write_clip(tmp_path / "repetition.npz", convert(synthesize_clip(activity, 2, seconds=6.0), 0))
     assert survey_folder(tmp_path).duplicates == {"late": "a", "other": "a"}
-
-
-def test_a_limb_that_moves_otherwise_is_another_take(tmp_path: Path):
-    clip, other = (synthesize_clip(activity, 1, seconds=6.0) for activity in ("walking", "punching"))
-    poses = clip.poses.copy()
-    poses[:, BONES[1:]] = other.poses[:, BONES[1:]]
-    write_clip(tmp_path / "a.npz", clip)
-    write_clip(tmp_path / "b.npz", replace(clip, poses=poses))
-    assert survey_folder(tmp_path).duplicates == {}
 
 
 @pytest.mark.slow

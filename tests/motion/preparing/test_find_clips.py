@@ -1,7 +1,6 @@
 """Folders: links, suffixes, other files, and several folders as one."""
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -86,17 +85,6 @@ def test_each_source_is_split_as_it_is_alone(home):
     assert manifest.groups["b/take0/1"] == "b/take0/0"
     assert all(parts[f"b/take{n}/{2 * n}"] == parts[f"b/take{n}/{2 * n + 1}"] for n in range(4))
     assert prepare_cache(mixed(home, a="one", c="two"), home / "other").digest != manifest.digest
-
-
-def test_links_and_copies_are_known_across_sources(home):
-    (home / "one" / "link.npz").symlink_to(home / "one" / "take0" / "0.npz")
-    shutil.copy(home / "one" / "take1" / "2.npz", home / "two" / "take9.npz")
-    manifest = prepare_cache(mixed(home, a="one", b="two"), home / "cache")
-    names = {clip.name for clip in manifest.clips}
-    assert "a/link" in names  # the nearer path counts
-    assert "a/take0/0" not in names
-    assert manifest.groups["b/take9"] == manifest.groups["a/take1/2"]
-    assert len({clip.split for clip in manifest.clips if clip.name in ("b/take9", "a/take1/2")}) == 1
 
 
 @pytest.mark.parametrize("drawn_by", ["frames", "clips"])

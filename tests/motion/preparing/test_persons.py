@@ -84,15 +84,6 @@ def test_absent_persons_are_missing_and_clips_of_nobody_refused():
         split().assign(["a1/x", "???/x"])
 
 
-@pytest.mark.parametrize(("changes", "said"), [
-    ({"kinds": {**KINDS, "sports": Kind(("a1",), 0, 0)}}, "a1 has two kinds"),
-    ({"kinds": {"walking": Kind(("a1", "a2"), 2, 1)}}, "data.split.kinds.walking: must have 3 persons"),
-])  # fmt: skip
-def test_impossible_splits_are_refused(changes: dict[str, Any], said: str):
-    with pytest.raises(InputError, match=re.escape(said)):
-        split(**changes)
-
-
 def test_the_shipped_persons_are_in_one_part_of_the_manifest(shipped: MotionSource, memmlp: Memmlp):
     """Clips of all persons of the config are prepared; one take is left out, a conversion."""
     by_rule = shipped.clips.split

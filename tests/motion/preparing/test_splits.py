@@ -178,14 +178,6 @@ def test_lists_divide_every_release_of_amass_alike(tmp_path, write):
     assert {name: found.groups[name] for name in same} == same
 
 
-def test_an_entry_is_the_file_of_its_name_and_two_others_are_refused(tmp_path):
-    split = ListSplit(write_lists(tmp_path))
-    both = [*OLD, stage_two(OLD[0])]
-    assert split.assign(both).parts[stage_two(OLD[0])] is None
-    with pytest.raises(InputError, match=r"BMLrub/.*_poses.npz and BMLrub/.*_stageii.npz"):
-        split.assign([renamed(OLD[0]), stage_two(OLD[0]), *OLD[1:]])
-
-
 def test_a_column_file_ties_clips_beside_patterns(tmp_path):
     file = tmp_path / "groups.csv"
     rows = {name: name.split("/")[0] for name in NAMES if name.startswith("martial")}

@@ -157,16 +157,6 @@ def test_variants_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path
     assert cell(table, "by position", "MPJPE").effect is not None  # it shows another branch
 
 
-def test_the_correction_is_the_same_whichever_mode_is_shown(sweep: Sweep, tmp_path: Path):
-    """Nobody gets a star by looking at one mode alone."""
-    find = fake_sweep(tmp_path, sweep, EFFECTS)
-    both, one = table_of(sweep, find), table_of(sweep, find, modes=("stream",))
-    assert one.modes == ("stream",)
-    assert one.comparisons == both.comparisons
-    for label, metric in (("no | memory", "MPJPE"), ("by position", "Jitter")):
-        assert cell(one, label, metric).effect == cell(both, label, metric).effect
-
-
 @pytest.mark.parametrize(("label", "word"), [("no | memory", "nan"), ("full_model", "inf")])
 def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(sweep, tmp_path, label: str, word: str):
     """A variant that diverged on a hard clip would be better for it; too short a clip takes no verdict."""

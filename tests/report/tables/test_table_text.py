@@ -1,7 +1,6 @@
 """Tables as text: words, the screen, Markdown, LaTeX and JSON."""
 
 import json
-import math
 import re
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from fake_table import SHIPPED, cell, printed
 from markdown_it import MarkdownIt
 
 from memmlp.report.tables.table import Cell, Effect, Table
-from memmlp.report.tables.table_text import FORMATS, MINUS, format_effect, format_value, make_legend
+from memmlp.report.tables.table_text import FORMATS, MINUS, format_effect, format_value
 from memmlp.sweep.sweep_file import load_sweep
 
 
@@ -47,18 +46,6 @@ def test_digits_of_values_and_differences(values, effect: Effect, metric: str, v
     shown = Cell(values, effect=effect)
     assert format_value(shown, metric) == value
     assert difference is None or format_effect(shown, metric) == difference
-
-
-def test_power_is_no_number_beyond_the_values_themselves(table: Table, monkeypatch: pytest.MonkeyPatch):
-    """With two seeds that differ, MPJREs of 901 degrees would have been found. A NaN mean is no size."""
-    (before,) = [line for line in make_legend(table) if "power" in line and line.startswith("stream")]
-    assert "cannot detect" not in before
-    cell(table, "no | memory", "MPJPE").values[0] = math.nan
-    assert before in make_legend(table)
-    monkeypatch.setattr(Table, "find_detectable", lambda *_: 901.0)
-    said = " ".join(make_legend(table))
-    assert "901" not in said
-    assert re.search("cannot detect[^;]* MPJRE", said)
 
 
 def test_markdown_escapes(table: Table):

@@ -135,25 +135,6 @@ def test_a_sweep_s_effects_curves_and_rounds(browser: Browser, tmp_path: Path):
         assert "gru203\N{EN DASH}" in rows
 
 
-def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, tmp_path: Path):
-    make_outputs(tmp_path)
-    gru, none = (run_of(tmp_path, variant, 0) for variant in ("gru", "none"))
-    small = "[...document.querySelectorAll('.grid td.n > small')].length"
-    told = "document.body.textContent.includes('The control has other data')"
-    with RunsServer(Answers(tmp_path, predict), 0) as running:
-        go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
-        assert browser.value(small) > 0
-        assert not browser.value(told)
-    none.manifest_path.write_text(json.dumps({**none.manifest, "data": "e" * 64}))
-    with RunsServer(Answers(tmp_path, predict), 0) as running:
-        go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
-        assert browser.value(told)
-        assert browser.value(small) == 0
-        go(browser, running.url, f"compare?runs={none.id},{gru.id}", f"{NAMES}.length == 2")
-        assert browser.value("document.body.textContent.includes('whose errors are not comparable')")
-        assert browser.value("document.querySelectorAll('.least').length") == 0
-
-
 def test_news_are_shown_without_a_touch(browser: Browser, server: RunsServer, home: Path):
     run = Run.from_id(home, "abcdef0123456789")
     go(browser, server.url, f"run/{run.id}", "document.querySelector('.plot svg')")

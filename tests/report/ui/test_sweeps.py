@@ -77,21 +77,6 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite
     assert said == "trained, an evaluation or export is missing"
 
 
-def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
-    """A sweep with another control has another table, though the runs stay as they are."""
-    folder, run, sweeps = outputs / "sweeps" / "mine", run_of(outputs, "gru", 0), sweeps_of(outputs)
-    sweep, _ = read_sweep(outputs)
-    assert describe(sweeps)["table"]["control"] == "none"
-    before = sweeps.refresh()
-    other = replace(sweep, control="gru", metrics=("FLOPs", "MPJRE", "MPJPE"))
-    save_sweep_copy(other.with_branch("combined"), folder)
-    page = describe(sweeps)
-    assert (page["metric"], page["branch"], page["table"]["control"]) == ("MPJRE", "combined", "gru")
-    (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
-    assert cell["value"] == pytest.approx(run.results["stream"]["combined"]["MPJRE"])
-    assert sweeps.refresh() != before
-
-
 def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
     """Most of the paper's tables have a control that does not stand first."""
     answers = Answers(outputs, predict, 0.0)

@@ -91,16 +91,6 @@ def test_an_owner_that_wakes_up_superseded_tells_the_study_nothing(tmp_path: Pat
     assert open_study(tmp_path).trials == []
 
 
-def test_a_study_is_looked_at_while_its_owner_works(tmp_path: Path):
-    assert Study.view(search(), "mine", tmp_path) is None
-    study = open_study(tmp_path)
-    director(study, tmp_path).update(2)
-    seen = Study.view(search(), "mine", tmp_path)
-    assert seen is not None
-    assert len(seen.trials) == 2
-    assert Study.view(search(), "other", tmp_path) is None
-
-
 @pytest.mark.slow
 def test_a_team_storage_and_a_bad_one(tmp_path: Path):
     study = open_study(tmp_path, storage=f"sqlite:///{tmp_path}/team.db")
