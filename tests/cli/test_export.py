@@ -1,19 +1,15 @@
 """`memmlp export`: what it rejects, what it copies, and a file in fp16 for Unity."""
 
 import json
-import re
 import subprocess
 import sys
 from pathlib import Path
-from shutil import copyfile
 from types import SimpleNamespace
 
-import onnx
 import pytest
 import tiny
 from cli.conftest import find_trained
 from conftest import Memmlp, one_line
-from onnx import TensorProto
 
 from memmlp.cli import export as module
 from memmlp.cli.export import ExportForm
@@ -76,36 +72,3 @@ def test_only_the_same_form_that_is_whole_is_copied(home: Path, tmp_path: Path):
     deployed.onnx.write_bytes(b"other")
     assert module.copy_deployed(run, out, fp32, 1e9) is None
     assert not out.exists()
-
-
-@pytest.mark.long
-def test_a_run_in_fp16_for_unity(home: Path, tmp_path: Path, memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(home)
-    run = find_trained(home).id
-    whole = ["--scope", "full", "--space", "unity", "--rotations", "quaternion", "--opset", "15"]
-    files, write = {}, module.write_graph
-
-    def kept(network: object, path: Path, run_id: str, form: ExportForm) -> None:
-        write(network, path, run_id, form)
-        files[form.full] = copyfile(path, tmp_path / f"{len(files)}.onnx")
-
-    monkeypatch.setattr(module, "write_graph", kept)
-    said = memmlp("export", run, "--out", "unity.onnx", *whole, "--precision", "fp16")
-    assert said.code == 0, said.err
-    assert "MPJPE" in said.out
-    assert float(re.search(r"full graph differs from torch by at most (\S+)", said.out)[1]) < 0.01
-    with monkeypatch.context() as patch:
-        patch.setattr("memmlp.cli.export.FULL_TOLERANCE", 1e-9)
-        patch.setattr(module, "write_graph", lambda *given: copyfile(files[given[-1].full], given[1]))
-        said = memmlp("export", run, "--out", "none.onnx", *whole, "--precision", "fp16")
-    assert said.code == 1
-    assert "none.onnx: not written" in said.err
-    assert not Path("none.onnx").exists()
-    model = onnx.load("unity.onnx")
-    onnx.checker.check_model(model, full_check=True)
-    assert [one.version for one in model.opset_import] == [15]
-    kinds = {tensor.data_type for tensor in model.graph.initializer}
-    assert {TensorProto.FLOAT, TensorProto.FLOAT16} <= kinds
-    shapes = {o.name: [d.dim_value for d in o.type.tensor_type.shape.dim] for o in model.graph.output}
-    assert shapes["rotations"] == [1, 22, 4]
-    assert not list(home.glob("*export*"))

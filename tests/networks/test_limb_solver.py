@@ -7,7 +7,7 @@ import pytest
 import tiny
 import torch
 
-from memmlp.motion.body import HANDS, HEAD, N_JOINTS, SPARSE_DIM
+from memmlp.motion.body import HEAD, N_JOINTS, SPARSE_DIM
 from memmlp.motion.body import SPARSE_POSITION as PLACES
 from memmlp.motion.body import SPARSE_ROTATION as TURNS
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, matrix_to_sixd, sixd_to_matrix
@@ -174,20 +174,6 @@ def test_hands_come_to_their_trackers_and_bones_keep_their_lengths(share: float)
         bones = turned[:, joint] @ (REST[child] - REST[joint])[..., None]
         torch.testing.assert_close(placed[:, joint] + bones[..., 0], placed[:, child])
     torch.testing.assert_close(turned @ turned.mT, torch.eye(3).double().expand_as(turned))
-
-
-def test_head_and_wrists_turn_as_their_trackers_and_the_rest_stays():
-    rotations, joints = random_body()
-    sparse = inputs(joints, within_reach(joints, 0.7))
-    sixd = limbs.use_tracker_rotations(matrix_to_sixd(rotations).flatten(1), sparse)
-    seen, tracked = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6))), [HEAD, *HANDS]
-    torch.testing.assert_close(seen[:, tracked], sixd_to_matrix(sparse[:, TURNS].unflatten(-1, (3, 6))))
-    others = [joint for joint in range(N_JOINTS) if joint not in tracked]
-    torch.testing.assert_close(seen[:, others], rotations[:, others])
-    turned, placed = limbs.bend_arms_to_trackers(seen, joints, sparse, REST)
-    kept = [joint for joint in range(N_JOINTS) if not SHOULDERS.start <= joint < ELBOWS.stop]
-    assert torch.equal(turned[:, kept], seen[:, kept])
-    assert torch.equal(placed[:, : ELBOWS.start], joints[:, : ELBOWS.start])
 
 
 def test_a_straight_arm_bends_about_its_axis_and_gradients_are_finite():

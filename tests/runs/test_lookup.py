@@ -7,7 +7,6 @@ from begun_runs import CONFIG, begun
 
 from memmlp.common.errors import InputError
 from memmlp.runs import lookup
-from memmlp.runs.run import Run
 
 
 def test_runs_are_found_by_the_beginning_of_their_id(tmp_path: Path):
@@ -27,16 +26,6 @@ def test_no_such_run_is_one_line(tmp_path: Path):
     for name in ("zz", "", "no/such"):
         with pytest.raises(InputError, match=f"run '{name}'"):
             lookup.find_run(tmp_path, name)
-
-
-def test_a_bare_folder_name_is_found_and_an_ambiguous_beginning_lists_the_runs(tmp_path: Path, monkeypatch):
-    runs = [Run.from_id(tmp_path, "ab" + digit * 14) for digit in "01"]
-    for run in runs:
-        run.begin("memmlp", {}, data="d", prerequisite=None)
-    with pytest.raises(InputError, match=r"2 run ids .*: ab0+, ab1+"):
-        lookup.find_run(tmp_path, "ab")
-    monkeypatch.chdir(runs[0].folder.parent)
-    assert lookup.find_run("outputs", runs[0].id).folder == runs[0].folder.resolve()
 
 
 def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):

@@ -113,13 +113,3 @@ def test_the_keys_that_differ_without_neutral_ones():
     ))  # fmt: skip
     assert list_differing_keys([vq, none]) == ["memory"]
     assert list_differing_keys([vq, none, other]) == ["memory", "memory.layers"]
-
-
-def test_the_data_differs_where_its_digest_does_and_is_told_apart_by_its_name():
-    first, second = ({"data": {"root": root, "weighting": "frames"}} for root in ("here", "/x/here"))
-    assert list_differing_keys([first, second], ["d", "d"]) == []
-    assert list_differing_keys([first, second], ["d", "e"]) == ["data.root"]
-    data = [{"name": "synth", "seed": 1}, {"name": "mocap", "root": "x"}, {"name": "mocap", "root": "y"}]
-    configs: list[dict[str, Any]] = [{"seed": i, "data": one} for i, one in enumerate(data)]
-    assert list_differing_keys(configs[:2], "de") == ["seed"]
-    assert list_differing_keys(configs, "def") == ["seed", "data.root"]

@@ -7,10 +7,9 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from memmlp.runs.metrics_log import LogRecord
 from memmlp.sweep import progress_table
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.progress_table import QUIET, Board, describe_progress, estimate_time_left
+from memmlp.sweep.progress_table import QUIET, Board, describe_progress
 
 
 @pytest.fixture
@@ -54,14 +53,3 @@ def test_a_run_whose_training_is_over_shows_its_stage(plan: Plan):
         assert describe_progress(run) == "starting"
         run.attempt("deployment")
         assert describe_progress(run) == "exporting"
-
-
-def test_the_time_left_follows_from_the_last_five_entries(monkeypatch: pytest.MonkeyPatch):
-    """Earlier steps took a hundred times as long: of a training's beginning, or of a busier machine."""
-    slow = [(100 * n, 1000.0 * n) for n in range(10)]
-    quick = [(900 + 100 * n, 9000 + 10.0 * n) for n in range(1, 5)]
-    log = [LogRecord(step, "train", {"loss": 1.0}, time) for step, time in slow + quick]
-    monkeypatch.setattr("time.time", lambda: 9043.0)
-    assert estimate_time_left(log, 1900) == pytest.approx(600 * 0.1 - 3)
-    assert estimate_time_left(log[:1], 1900) is None
-    assert estimate_time_left(log, 1300) == 0

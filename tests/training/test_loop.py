@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from unittest import mock
 
 import pytest
 import torch
 from tiny_tasks import OPTIM, TASKS, motion_task, weights
 
-from memmlp.common import progress
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.runs.run import Run
-from memmlp.training import loop
 from memmlp.training.loop import train
 from memmlp.training.train_network import compute_perplexity
 
@@ -53,35 +50,6 @@ def test_a_resumed_run_is_the_same_run(make, tmp_path):
     assert expected.keys() == got.keys()
     assert all(torch.equal(expected[name], got[name]) for name in expected)
     assert [m.values for m in whole.metrics()] == [m.values for m in broken.metrics()]
-
-
-def test_a_killed_training_says_from_where_it_goes_on_and_counts_all_its_seconds(monkeypatch, tmp_path):
-    """A step takes a second here. It is killed in its eighth step, of which its checkpoint has five."""
-    clock, run = iter(range(1000)), Run(tmp_path)
-    now = mock.Mock(monotonic=lambda: now.seconds, seconds=0)
-    monkeypatch.setattr(loop, "time", now)
-
-    def task(killed_at: int | None):
-        made = motion_task()
-        step = made.step
-
-        def timed(number: int):
-            if number == killed_at:
-                raise Kill
-            now.seconds = next(clock)
-            return step(number)
-
-        made.step = timed
-        return made
-
-    said: list[str] = []
-    with progress.send_announcements_to(said.append):
-        with pytest.raises(Kill):
-            train(task(7), OPTIM, run, 0, "killed")
-        assert not said
-        train(task(None), OPTIM, run, 0, "again")
-    assert said == [f"again: resumes from the last checkpoint, at step 5 of {OPTIM.steps}"]
-    assert run.manifest["seconds"] == {"train": OPTIM.steps}
 
 
 @pytest.mark.slow

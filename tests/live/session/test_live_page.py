@@ -94,25 +94,6 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
     assert browser.errors == []
 
 
-@pytest.mark.parametrize(("worn", "what"), [(True, "trackers"), (False, "the clip")])
-def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser, clip, worn, what: str):
-    browser.size(240, 200)  # nothing is clicked
-    words = make_greeting(ClipSource(clip, 60), "tiny", remark="hardly trained" if worn else "")
-    with LiveServer(Hub(words | {"wearer": worn}), 0) as server:
-        browser.open(server.url)
-        browser.wait(f"document.querySelector('#status').textContent == 'waiting for {what}'")
-        assert (
-            browser.value("document.querySelector('#mean').textContent") == "\N{EN DASH}"
-        )  # without a frame
-        assert browser.value("document.querySelector('#remark').hidden") != worn
-        if worn:
-            said = browser.value("document.querySelector('#remark').textContent")
-            assert said == "This network is hardly trained."
-        server.hub.publish({"dropped": 0, "malformed": 3})
-        browser.wait("document.querySelector('#status').textContent.endsWith('3 packets malformed')")
-    browser.wait("document.querySelector('#status').textContent == 'not connected'")
-
-
 class Worn(ClipSource):
     """A clip that counts as somebody's devices."""
 

@@ -150,21 +150,6 @@ def test_two_processes_at_once(root, tmp_path):
     assert Manifest.load(tmp_path / "cache").digest == digests[0]
 
 
-def test_every_clip_knows_its_group(root, tmp_path):
-    """Ties are transitive: 1, 2 and 3 are one group through two patterns, and named after its first clip."""
-    tied = SeededSplit(test=0.2, val=0.2, groups=["a/[12]$", "a/[23]$"])
-    manifest = prepare_cache(source(root, split=tied), tmp_path / "cache")
-    expected = {f"a/{n}": "a/1" if n in (1, 2, 3) else f"a/{n}" for n in range(10)}
-    assert manifest.groups == Manifest.load(tmp_path / "cache").groups == expected
-    for part in ("train", "val", "test"):
-        frames = MotionDataset.open(tmp_path / "cache", part).to("cpu")
-        assert frames.groups == [expected[name] for name in frames.names]
-    splits = SeededSplit(test=0, val=0), SeededSplit(test=0, val=0, groups=["a/[12]$"])
-    first, second = (prepare_cache(source(root, split=split), tmp_path / "other") for split in splits)
-    assert first.groups == {name: name for name in expected}
-    assert (first.digest, second.groups["a/2"]) == (second.digest, "a/1")
-
-
 def test_frames_of_an_older_component_version_are_made_again(root, tmp_path, monkeypatch):
     first = prepare_cache(source(root), tmp_path / "cache")
     made = (tmp_path / "cache" / "train.npy").stat().st_mtime_ns

@@ -16,8 +16,6 @@ from memmlp.report.pictures import clip_pictures
 from memmlp.report.pictures.clip_pictures import (
     ClipPiece,
     check_picture_path,
-    find_colour_scale_top,
-    find_frame_range,
     write_picture,
 )
 
@@ -101,23 +99,8 @@ def test_bad_files_are_rejected(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_piece_without_frames_is_rejected():
-    assert find_frame_range(120, "walk", 0.5, None) == (30, 120)
-    assert find_frame_range(120, "walk", 0.0, 9.0) == (0, 120)
-    for begin, end in ((2.0, None), (1.0, 1.0), (float("nan"), None)):
-        with pytest.raises(InputError, match="begin"):
-            find_frame_range(120, "walk", begin, end)
-
-
 def test_the_camera_follows_the_person():
     moving = ClipPiece("walk", TRUTH + np.linspace(0, 4, 31)[:, None, None] * [1, 0, 0], {"a": TRUTH})
     apart = moving.smooth_camera_path() - moving.truth[:, 0, :2]
     assert np.abs(apart[10:21]).max() < 0.8
     assert np.ptp(moving.smooth_camera_path()[:, 0]) > 1.5
-
-
-def test_the_scale_is_round_and_leaves_few_above():
-    errors = np.random.default_rng(0).gamma(2, 4, 5000)
-    assert find_colour_scale_top(errors) in (25, 30)
-    assert (errors > find_colour_scale_top(errors)).mean() <= 0.02
-    assert (find_colour_scale_top(np.zeros(3)), find_colour_scale_top(np.full(3, 1e6))) == (10, 100)

@@ -115,20 +115,6 @@ def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
     assert cell(table, "no | memory", "Jitter").effect.verdict == Verdict.EQUIVALENT
 
 
-def test_a_row_has_its_own_control(sweep: Sweep, tmp_path: Path):
-    variants = tuple(
-        replace(variant, against="by position") if variant.paper else variant
-        for variant in sweep.variants[1:3]
-    )
-    chain = replace(sweep, variants=(*variants, *sweep.variants[3:]))
-    table = table_of(chain, fake_sweep(tmp_path, chain, EFFECTS))
-    means = [cell(table, label, "MPJPE").mean for label in ("no | memory", "by position")]
-    found = cell(table, "no | memory", "MPJPE")
-    assert found.effect.mean == pytest.approx(means[0] - means[1])
-    assert found.paper_effect is None  # the paper has no value for the control
-    assert "of 'no | memory' from 'by position'" in " ".join(printed(table, 200).split())
-
-
 def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
     source = replace(sweep, branch_source="the text says so").with_branch("combined")
     find = fake_sweep(tmp_path, sweep)

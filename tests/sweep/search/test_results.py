@@ -49,17 +49,6 @@ def test_a_pruned_trial_has_no_value_in_the_csv(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_two_objectives_give_a_front(tmp_path: Path):
-    study = fake_search.open_study(tmp_path, objectives=["MPJPE", "Jitter"])
-    fake_search.to_the_end(study, tmp_path)
-    front = study.list_best()
-    assert len(front) == 6  # Jitter is 20 less MPJPE here, so that none is better in both
-    assert [trial.values[0] for trial in front] == sorted(trial.values[0] for trial in front)
-    files = results.write_experiments(study, tmp_path, ["loss"])
-    assert [file.name for file in files] == ["best.yaml", *(f"trial-{t.number}.yaml" for t in front[1:])]
-
-
-@pytest.mark.slow
 def test_what_a_search_leaves(tmp_path: Path):
     study = fake_search.open_study(tmp_path)
     fake_search.to_the_end(study, tmp_path)
