@@ -55,7 +55,7 @@ VALUES = {
 
 def parse_hydra_arguments(argv: Sequence[str]) -> argparse.Namespace:
     """Parse Hydra's command line, with flags and overrides in any order, and activate its plugins. Raises
-    InputError for an unknown flag, or a plugin that cannot be used."""
+    InputError for an unknown flag, flags that exclude each other, or a plugin that cannot be used."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.error = _raise_input_error  # type: ignore[method-assign]
     for flag, short in SWITCHES.items():
@@ -65,6 +65,8 @@ def parse_hydra_arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--info", "-i", nargs="?", const="all")
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_intermixed_args(list(argv))
+    if sum(map(bool, (args.run, args.multirun, args.cfg, args.info, args.shell_completion))) > 1:
+        _raise_input_error("--run, --multirun, --cfg, --info, --shell-completion: expected only one of them")
     args.overrides = list(map(keep_text, args.overrides))
     plugins.activate(plugins.find_named_packages(args.overrides))
     Plugins.instance().register(UserConfigs)
@@ -366,7 +368,8 @@ def _find_folder(name: str | Path, option: str) -> Path:
 
 def _list_jobs(args: argparse.Namespace) -> list[list[str]]:
     """Return the overrides of each job; there is one job without a multirun. Raises InputError for an
-    override that cannot be parsed, or a second `experiment=`, which would replace the first one."""
+    override that cannot be parsed, or would replace another one: a second `experiment=`, or in a multirun a
+    second override of a group's keys."""
     with _convert_errors(args.overrides):
         parsed = OverridesParser.create().parse_overrides(args.overrides)
         chosen = list(dict.fromkeys(str(one.input_line) for one in parsed if one.key_or_group == EXPERIMENT))
@@ -379,6 +382,9 @@ def _list_jobs(args: argparse.Namespace) -> list[list[str]]:
             key, sweeps = override.get_key_element(), override.is_sweep_override()
             if sweeps and not override.is_discrete_sweep():
                 raise InputError(f"{override.input_line}: must be a list of values, a choice or a range")
+            if before := [value for value in choices.get(key, ()) if value.startswith(f"{key}={{")]:
+                how = f"in a multirun, set {key}.NAME=VALUE"
+                raise InputError(f"{override.input_line}: would replace {before[0]}; {how}")
             values = override.sweep_string_iterator() if sweeps else [override.get_value_element_as_str()]
             choices[key] = [f"{key}={value}" for value in values]
         return [list(job) for job in itertools.product(*choices.values())]

@@ -121,12 +121,13 @@ BAD = {
     ],
     "broken command lines": [
         (["model.width"], ["model.width", "KEY=VALUE"]), (["model.width=["], ["model.width=[", "KEY=VALUE"]),
-        (["--no-such-flag"], ["--no-such-flag"]),
+        (["--no-such-flag"], ["--no-such-flag"]), (["-m", "--cfg", "job"], ["--multirun, --cfg", "only one"]),
         (["--config-dir", "nowhere"], ["nowhere", "existing folder"]),
     ],
     "a bad second job, before the first starts": [
         (["-m", "model.width=16,-1"], ["model.width=-1", "at least 1"]),
         (["-m", "memory=vq,mamba"], ["memory=mamba", "no_codes, none, vq"]),
+        (["-m", "model={width:16},{width:32}", "model={depth:3}"], ["model={depth:3}", "model={width:16}"]),
     ],
 }  # fmt: skip
 

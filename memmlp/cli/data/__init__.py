@@ -31,9 +31,10 @@ def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
 
     The clips show walking, squats, reaching and other movements.
     """
+    from memmlp.motion.preparing.find_clips import find_files
     from memmlp.motion.synthetic import synthesize
 
-    if next(out.rglob("*.npz"), None):
+    if find_files(out, ".npz").files:
         raise InputError(f"--out {out}: already has clips; expected a folder without npz files")
     paths = synthesize(out, minutes=minutes, seed=seed, fps=fps)
     click.echo(f"{len(paths)} clips, {minutes:g} minutes, in {out}")

@@ -36,6 +36,7 @@ from memmlp.motion.importing.recordings import (
     read_recording,
 )
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
+from memmlp.motion.preparing.find_clips import find_files
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,7 @@ def _check_import(files: Mapping[Path, Path], out: Path, settings: ImportSetting
     if count > 1:
         raise InputError(f"{npz.with_suffix('').as_posix()}: {count} recordings have this name; expected one")
     expected = {path.with_suffix(".npz") for path in files}
-    foreign = sorted({path.relative_to(out) for path in out.rglob("*.npz")} - expected)
+    foreign = sorted(set(map(Path, find_files(out, ".npz").files)) - expected)
     if foreign or (out.exists() and not out.is_dir()):
         problem = f"has other clips, such as {foreign[0].as_posix()}" if foreign else "is a file"
         raise InputError(f"{out}: {problem}; must be a new folder, or the folder of the same import")

@@ -11,10 +11,12 @@ from typing import NamedTuple
 import yaml
 
 from memmlp.common.errors import InputError, describe_read_error
+from memmlp.common.progress import notify
 from memmlp.motion.clip import FRAME_RATE_RANGE
 from memmlp.motion.formats.asf_amc import read_amc
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.recording import Recording
+from memmlp.motion.preparing.find_clips import FolderContent, find_files
 
 READERS: dict[str, Callable[[Path], Recording]] = {".bvh": read_bvh, ".amc": read_amc}
 EXPECTED = f"expected a {' or '.join(READERS)} file, or a folder with such files"
@@ -35,13 +37,17 @@ DATABASES = Rate(120.0, "the rate of CMU and HDM05, because AMC files do not hav
 
 
 def find_recordings(source: Path) -> dict[Path, Path]:
-    """Find the recordings of a folder, or a single recording: path below the folder -> path, sorted. Raises
-    InputError if the folder or file is missing, or the folder has no recordings."""
+    """Find the recordings of a folder, or a single recording: path below the folder -> path, sorted. Linked
+    folders are searched as in `find_files`. Raises InputError if the folder or file is missing, or the folder
+    has no recordings."""
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; {EXPECTED}")
+    content = find_files(source, *READERS) if source.is_dir() else FolderContent([source.name])
     top = source if source.is_dir() else source.parent
-    paths = sorted(source.rglob("*")) if source.is_dir() else [source]
-    files = {p.relative_to(top): p for p in paths if p.suffix.lower() in READERS and p.is_file()}
+    for folder, reason in content.unreadable.items():
+        notify(f"{top / folder}: {reason}")
+    paths = {Path(file): top / file for file in content.files}
+    files = {name: path for name, path in paths.items() if path.suffix.lower() in READERS and path.is_file()}
     if not files:
         raise InputError(f"{source}: no recording found; {EXPECTED}")
     return files

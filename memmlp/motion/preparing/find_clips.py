@@ -1,4 +1,4 @@
-"""Finds the npz files in one or more folders. A file with several paths is listed once."""
+"""Finds files in folders, such as the npz files of one or more. A file with several paths is listed once."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ Root = Path | NamedFolders
 
 @dataclass
 class FolderContent:
-    """The content of a folder, with relative paths: the sorted npz files, and folder that cannot be listed ->
-    the reason. Of several paths of a file, the shortest is listed, and real before linked paths."""
+    """The content of a folder, with relative paths: the sorted files, and folder that cannot be listed -> the
+    reason. Of several paths of a file, the shortest is listed, and real before linked paths."""
 
     files: list[str] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
@@ -87,6 +87,17 @@ def get_source_name(clip: str) -> str:
 def _find_in_folder(root: Path) -> FolderContent:
     if not root.is_dir():
         raise InputError(f"data.root={root}: no such folder; must be the folder of your npz clips")
+    content = find_files(root, SUFFIX)
+    if not content.files:
+        raise InputError(
+            f"data.root={root}: has no npz files; create them with memmlp data synth or memmlp data import"
+        )
+    return content
+
+
+def find_files(root: Path, *endings: str) -> FolderContent:
+    """Find the files below a folder whose names end with one of the `endings`, in any letter case. Links to
+    files and folders are followed, and hidden files are ignored."""
     content, files = FolderContent(), dict[object, str]()
     folders = {_identify_path(root)}
     level = [""]
@@ -98,13 +109,9 @@ def _find_in_folder(root: Path) -> FolderContent:
             if is_folder and identity not in folders:
                 folders.add(identity)
                 level.append(path)
-            elif not is_folder and path.lower().endswith(SUFFIX):
+            elif not is_folder and path.lower().endswith(endings):
                 files.setdefault(identity, path)
     content.files = sorted(files.values())
-    if not content.files:
-        raise InputError(
-            f"data.root={root}: has no npz files; create them with memmlp data synth or memmlp data import"
-        )
     return content
 
 

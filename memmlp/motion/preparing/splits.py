@@ -26,6 +26,7 @@ from memmlp.motion.preparing.amass_names import (
     normalize_subset,
     strip_archives,
 )
+from memmlp.motion.preparing.find_clips import find_files
 from memmlp.motion.preparing.groups import Grouping
 
 LISTED = ("train", "test")  # the parts with published lists
@@ -380,7 +381,8 @@ def _check_one_release(matches: Iterable[Sequence[str]]) -> None:
 
 
 def _read_lists(folder: Path) -> dict[str, str]:
-    files = {part: sorted(folder.rglob(f"{part}_split.txt")) for part in LISTED}
+    found = [folder / file for file in find_files(folder, "_split.txt").files]
+    files = {part: [file for file in found if file.name == f"{part}_split.txt"] for part in LISTED}
     if not files["train"]:
         raise InputError(f"data.split.folder={folder}: has no SUBSET/train_split.txt")
     every = [(part, file) for part in LISTED for file in files[part]]

@@ -1,12 +1,14 @@
 """Recordings: which files are found and read, and their true frame rates."""
 
 import hashlib
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from bvh_samples import person, refuse, write
 
+from memmlp.common.progress import send_announcements_to
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.recordings import DIGITS, find_rate, find_recordings, read_recording
 
@@ -64,3 +66,21 @@ def test_other_files_are_passed_over(tmp_path: Path) -> None:
         with refuse(tmp_path / "all" / "README.txt", "expected a .bvh or .amc file"):
             action(tmp_path / "all" / "README.txt")
     assert len(read_recording(tmp_path / "all" / "deep" / "A.BVH")) == 3
+
+
+def test_linked_folders_are_searched_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of links to data sets, one of which leads back."""
+    write(tmp_path / "cmu", person("cmu_daz", 3, 0).text(), "05/a.bvh")
+    (tmp_path / "sets").mkdir()
+    for name in ("one", "two"):
+        (tmp_path / "sets" / name).symlink_to(tmp_path / "cmu")
+    (tmp_path / "cmu" / "back").symlink_to(tmp_path / "sets")
+    assert find_recordings(tmp_path / "sets") == {Path("one/05/a.bvh"): tmp_path / "sets/one/05/a.bvh"}
+    lines: list[str] = []
+    scan = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda path: scan(tmp_path / "none" if "two" in str(path) else path))
+    (tmp_path / "sets/two").unlink()
+    (tmp_path / "sets/two").mkdir()
+    with send_announcements_to(lines.append):
+        find_recordings(tmp_path / "sets")
+    assert lines == [f"{tmp_path}/sets/two: cannot be listed (No such file or directory)"]

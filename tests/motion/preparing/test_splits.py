@@ -102,6 +102,9 @@ def test_lists_in_agrols_format(tmp_path):
         ListSplit(tmp_path)
     test.write_text("")
     assert ListSplit(tmp_path).entry_counts == {"CMU": 9}
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "CMU").symlink_to(tmp_path / "CMU")
+    assert ListSplit(tmp_path / "linked").entry_counts == {"CMU": 9}
 
 
 def test_subsets_by_folder_under_every_name_but_once():
