@@ -38,6 +38,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 
 CHECKED_FRAMES = 8  # frames at the start of a stream that are computed both together and one by one
+MIXED_FRAMES = 4  # frames at the end of two clips that are computed both together and beside a copy
 
 
 def predict_stream(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
@@ -131,9 +132,28 @@ MODE_FUNCTIONS: dict[str, Callable[[MotionModel, Sequence[Tensor]], list[Tensor]
 
 
 def predict(network: MotionModel, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
-    """Predict the motion (N, 198) of each clip (N, 252), with at most `batch` clips in parallel."""
-    groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
+    """Predict the motion (N, 198) of each clip (N, 252), with at most `batch` clips in parallel. If a network
+    mixes the clips of a batch, it gets one clip at a time."""
+    size = 1 if batch > 1 and mixes_clips(network, clips) else batch
+    groups = [clips[i : i + size] for i in range(0, len(clips), size)]
     return [motion for group in groups for motion in MODE_FUNCTIONS[mode](network, group)]
+
+
+@torch.no_grad()
+def mixes_clips(network: MotionModel, clips: Sequence[Tensor]) -> bool:
+    """Return whether the motion of the first of clips (N, 252) depends on the clip beside it in a batch."""
+    if network.takes_whole_clip or len(clips) < 2:
+        return False
+    count = min(MIXED_FRAMES, *map(len, clips[:2]))
+    first, second = (clip[-count:, :SPARSE_DIM] for clip in clips[:2])
+    motions = []
+    for other in (first, second):
+        with torch.random.fork_rng([first.device] if first.is_cuda else []):  # both draw the same numbers
+            state = network.initial_state(2)
+            for frame in torch.stack([first, other]).split(1, 1):
+                motion, state = network.advance(frame, state, 1)
+        motions.append(motion[0])
+    return not torch.allclose(motions[0], motions[1], atol=1e-4, equal_nan=True)
 
 
 def measure_clip(

@@ -6,6 +6,8 @@ import torch
 
 from memmlp.evaluation.modes import (
     count_frames_per_call,
+    mixes_clips,
+    predict,
     predict_frame_by_frame,
     predict_stream,
     predict_windows,
@@ -56,3 +58,19 @@ def test_a_network_that_would_see_later_frames_gets_one_frame_per_call():
     assert count_frames_per_call(model, CLIPS[0][None, :, :54]) == 1
     (motion,) = predict_stream(model, CLIPS[:1])
     torch.testing.assert_close(motion[:, :54], CLIPS[0][:, :54])
+
+
+class MixesClips(WindowlessModel):
+    """A network that subtracts the mean of its batch, like a normalisation over the wrong dimension."""
+
+    def advance(self, sparse, state, newest=None):
+        return (sparse - sparse.mean(0)).repeat(1, 1, 4)[..., :198], state
+
+
+def test_a_network_that_mixes_clips_gets_one_at_a_time():
+    model = MixesClips(tiny.normalizer(), 7)
+    assert all(motion.abs().max() < 1e-6 for motion in predict(model, CLIPS, "stream", 4))
+    sampled = tiny.model(blend="sampled").double()
+    before = torch.get_rng_state()
+    assert not mixes_clips(sampled, CLIPS)
+    assert torch.equal(torch.get_rng_state(), before)
