@@ -21,7 +21,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import hydra  # noqa: F401
 import pytest
 import torch  # noqa: F401
 
