@@ -1,8 +1,6 @@
 """The wheel and the source distribution, installed in a new environment outside the checkout (make dist)."""
 
-import json
 import os
-import shutil
 import subprocess
 import venv
 import zipfile
@@ -10,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from command_line import TINY
-from own_package import EXAMPLE, KILLED, PACKAGE
 
 import memmlp
 
@@ -85,22 +82,3 @@ def test_it_works_outside_the_checkout(bin_folder: Path, tmp_path: Path):
     assert run(python, "-c", streams, folder=tmp_path) == "{60.0}\n"
     shown = run(python, "-c", "import memmlp; print(*dir(memmlp))", folder=tmp_path).split()
     assert set(memmlp.__all__) <= set(shown)
-
-
-def test_a_custom_package_is_found_by_its_entry_point(bin_folder: Path, tmp_path: Path):
-    """Its memory, term and metric; and one line names the package where it is not installed."""
-    pip = [bin_folder / "python", "-m", "pip", "--disable-pip-version-check", "--quiet"]
-    copy = shutil.copytree(EXAMPLE, tmp_path / "source")  # a build leaves files beside its source
-    run(*pip, "install", "--no-deps", copy, folder=tmp_path)
-    command, home = bin_folder / "memmlp", tmp_path / "home"
-    home.mkdir()
-    assert "FootSkate" in run(command, "train", "experiment=feet", *KILLED, folder=home)
-    (manifest,) = (json.loads(path.read_text()) for path in home.glob("outputs/runs/*/manifest.json"))
-    assert manifest["plugins"][PACKAGE]["version"] == "0.1.0"
-    sweep = [shutil.copy(EXAMPLE / "feet.yaml", home), *KILLED, "export.graph=off"]
-    assert "2 of 2 runs done" in run(command, "sweep", *sweep, "--workers", "1", folder=home)
-    table = json.loads(run(command, "table", *sweep, "--format", "json", folder=home))
-    assert table["rows"][0]["cells"]["stream"]["FootSkate"]["mean"] > 0
-    run(*pip, "uninstall", "--yes", PACKAGE, folder=home)
-    said = run(command, "eval", manifest["id"], folder=home, code=2)
-    assert said.startswith(f"memmlp: run {manifest['id']}: needs the package {PACKAGE} 0.1.0")

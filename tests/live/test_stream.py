@@ -89,7 +89,6 @@ CHANGING = np.concatenate([np.arange(0, 1, 1 / 90), np.arange(1, 2, 1 / 30), np.
 RATES = {  # Hz: times, bounds on mean and most, cm; beside: measured; with the newest sample as frame
     "30": (np.arange(0, 4, 1 / 30), 1.6, 7.5),  # 1.54, 7.18; 16.8, 34.2
     "72": (np.arange(0, 4, 1 / 72), 0.12, 0.85),  # 0.112, 0.827; 7.5, 32.6
-    "90": (np.arange(0, 4, 1 / 90), 0.18, 0.95),  # 0.166, 0.896; 10.1, 28.5
     "90, 30, 120": (CHANGING, 0.4, 7.5),  # 0.375, 7.18; 5.7, 34.2
     "120": (np.arange(0, 4, 1 / 120), 1e-3, 1e-3),  # every second sample is a frame
 }

@@ -54,16 +54,6 @@ def test_names_are_kept_and_bad_or_equal_ones_refused(folder: Path, tmp_path: Pa
         plan_export(folder, tmp_path / "out", "bvh")
 
 
-def test_nothing_usable_is_an_error(folder: Path, tmp_path: Path):
-    for name in ("walk", "dance/one.v2"):
-        (folder / f"{name}.npz").write_bytes(b"no npz")
-    with pytest.raises(InputError, match=r"no usable clip in 4 files; the first: bad\.npz"):
-        export(plan_export(folder, tmp_path / "out", "bvh"))
-    with pytest.raises(InputError, match=r"bad\.npz: not a zip"):
-        export(plan_export(folder / "bad.npz", tmp_path / "bad.bvh"))
-    assert not [name for name in ("out", "bad.bvh") if (tmp_path / name).exists()]
-
-
 def test_a_clip_keeps_its_rate_or_gets_another_and_is_exported_on_its_import_s_body(
     folder: Path, tmp_path: Path
 ):

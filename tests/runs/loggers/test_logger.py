@@ -9,7 +9,6 @@ from fake_logger import FakeLogger, Server, a_run, losses
 from processes import until
 
 from memmlp.common.files import write_json
-from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.loggers import logger as module
 from memmlp.runs.loggers.logger import Loggers, LogReader, Session, read_run_facts, sync_runs
 from memmlp.runs.lookup import add_tags
@@ -121,26 +120,6 @@ def test_a_sync_leaves_runs_in_progress_and_tells_what_fails(tmp_path: Path):
     with live.lock():
         assert sync_runs(logger, [live, bad, good], said.append) == {"live": 1, "failed": 1, "shown": 1}
     assert "config.yaml" in said[0]
-
-
-def test_status_is_that_of_the_folder(tmp_path: Path):
-    run = a_run(tmp_path)
-    assert read_run_facts(run, running=True).status == "running"
-    assert (read_run_facts(run).status, read_run_facts(run).ended) == ("killed", run.metrics()[-1].time)
-    run.fail("a reason")
-    assert (read_run_facts(run).status, read_run_facts(run).reason) == ("failed", "a reason")
-    assert read_run_facts(run, running=True).reason is None
-    run.retry()
-    run.request_stages(["stream-0", "fp32-0"])
-    run.finish([])
-    assert read_run_facts(run).status == "killed"
-    run.evaluations.mkdir()
-    write_report(run.evaluation("stream-0"), {"mode": "stream", "mean": {}, "clips": []})
-    assert read_run_facts(run).status == "killed"
-    run.deployment("fp32-0").folder.mkdir(parents=True)
-    run.deployment("fp32-0").finish({})
-    assert read_run_facts(run).status == "done"
-    assert read_run_facts(run, running=True).ended is None
 
 
 def test_a_tail_reads_the_last_of_repeated_steps_and_then_what_follows(tmp_path: Path):
