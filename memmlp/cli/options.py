@@ -108,7 +108,8 @@ together_option = click.option(
     "--together",
     multiple=True,
     metavar="PATTERN",
-    help="Count test clips as one group if PATTERN matches the same text in their names; repeatable.",
+    help="Count test clips as one group if the parentheses in PATTERN match the same text in their names; "
+    "repeatable.",
 )
 
 

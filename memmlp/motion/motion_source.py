@@ -76,7 +76,9 @@ class ShippedMotion:
         from memmlp.motion.dataset import MotionDataset
 
         if part != "test":
-            raise InputError(f"{self.clip}: needs the network's data; set data.root=FOLDER")
+            raise InputError(
+                f"{self.clip.stem}: the only clip that a shipped network has; {part} clips need a run of your own"
+            )
         clip, _ = resample(read_clip(self.clip, self.clip.stem))
         frames = torch.from_numpy(np.concatenate(list(compute_frame_blocks(clip, self.rest))))
         return MotionDataset(frames, torch.tensor([0]), torch.tensor([len(frames)]), [clip.name])

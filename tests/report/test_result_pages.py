@@ -121,7 +121,7 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
 
     def coarser(patterns: Sequence[str]):
         assert patterns == ("a", "b")
-        return make_table(sweep, group_clips(kept.select_runs(sweep), ["."])[0])
+        return make_table(sweep, group_clips(kept.select_runs(sweep), ["(.)"])[0])
 
     made = made._replace(regroup=coarser)
     line = fill('{{ overview("a", "b") }}', made).splitlines()[-1]

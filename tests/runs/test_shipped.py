@@ -32,6 +32,11 @@ def test_names_are_found_and_unknown_ones_refused(tmp_path: Path):
         find_run(tmp_path, "recurrent_poser_2")
 
 
+def test_a_shipped_network_has_no_training_clips():
+    with pytest.raises(InputError, match=r"^cmu_86_01: .*; train clips need a run of your own$"):
+        ShippedMotion(find_shipped_clip(), load_rest_joints("builtin")).open("train")
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_files_and_persons_are_those_of_the_card(name: str, tmp_path: Path):
     run, card = find_run(tmp_path, name), read_card(name)

@@ -7,7 +7,7 @@ namespace Memmlp
 {
     /// <summary>
     /// The network with its memory: one step for each frame at 60 Hz, from head and hands to a whole body.
-    /// The asset is what `memmlp export RUN --scope full --space unity --out body.onnx` writes.
+    /// The asset is what `memmlp export RUN --scope full --space unity --opset 15 --out body.onnx` writes.
     /// Everything is in Unity's axes and metres. A tracker's rotation is the turn from the T-pose (facing +Z).
     /// </summary>
     public sealed class FullBody : IDisposable

@@ -29,7 +29,7 @@ namespace Memmlp
             HumanBodyBones.LeftHand, HumanBodyBones.RightHand,
         };
 
-        [Tooltip("What memmlp export --scope full --space unity wrote")]
+        [Tooltip("What memmlp export --scope full --space unity --opset 15 wrote")]
         public ModelAsset network;
 
         [Tooltip("What the devices' poses are relative to: the XR Origin's floor")]

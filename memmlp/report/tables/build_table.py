@@ -7,6 +7,7 @@ made the run.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -326,13 +327,14 @@ def group_clips(
 
     Args:
         runs: the finished runs of a sweep's variants, by seed.
-        patterns: regular expressions, as in `data.split.groups`.
+        patterns: regular expressions, as in `data.split.groups`, with parentheses around the text that the
+            clips of a group share.
 
     Returns:
         The variants' runs by seed, and a flag that describes the merged groups.
 
     Raises:
-        InputError: if a pattern is not a regular expression, or merges no groups.
+        InputError: if a pattern is not a regular expression, has no parentheses, or merges no groups.
     """
 
     def regroup(patterns: Sequence[str]) -> dict[str, RunsBySeed]:
@@ -351,6 +353,8 @@ def group_clips(
             merged = regroup([pattern])
         except InputError as error:
             raise InputError(f"--together {pattern}: {str(error).partition(': ')[2]}") from None
+        if re.compile(pattern).groups == 0:
+            raise InputError(f"--together {pattern}: must have (parentheses) around the text of a group")
         if count_groups(merged) == before:
             raise InputError(f"--together {pattern}: must match clips in different groups; nothing to merge")
     if not patterns:

@@ -66,7 +66,9 @@ def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(t
     assert [row.cells for row in make_table(sweep, found).rows] == cells
     assert [row.cells for row in make_table(sweep, own).rows] != cells
     assert group_clips(own, []) == (own, ())
-    with pytest.raises(InputError, match=r"^--together nothing: must match clips in different groups"):
-        group_clips(own, ["^(kicks)/", "nothing"])
+    with pytest.raises(InputError, match=r"^--together \(nothing\): must match clips in different groups"):
+        group_clips(own, ["^(kicks)/", "(nothing)"])
+    with pytest.raises(InputError, match=r"^--together kicks: must have \(parentheses\)"):
+        group_clips(own, ["kicks"])
     with pytest.raises(InputError, match=r"^--together \(: .*regular expression"):
         group_clips(own, ["("])
