@@ -29,7 +29,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command("demo", "demo", "Show a network on a real recording, then a small ablation, in minutes.", True),
+    "demo": Command("demo", "demo", "Show a network on a real recording, then run a small ablation.", True),
     "train": Command("train", "command", "Train, evaluate, export and time one configuration (Hydra).", True),
     "data": Command("data", "data", "Make, import, prepare, inspect and export motion data."),
     "sweep": Command("sweep", "sweep", "Run the missing runs of a table or of your own sweep.", True),

@@ -70,6 +70,8 @@ def format_card(card: Mapping[str, Any]) -> Iterator[str]:
     yield "| branch | MPJRE deg | MPJPE cm | MPJVE cm/s | Jitter 10² m/s³ |"
     yield "|---|---:|---:|---:|---:|"
     for branch, row in card["errors"].items():
+        if branch == "position" and row["MPJPE"] == card["errors"]["rotation"]["MPJPE"]:
+            continue  # a network without position branch
         cells = [_format_interval(row.get(metric)) for metric in ("MPJRE", "MPJPE", "MPJVE", "Jitter")]
         yield f"| {branch} | {' | '.join(cells)} |"
     errors = card["errors"]["rotation"]

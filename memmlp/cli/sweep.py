@@ -35,7 +35,11 @@ if TYPE_CHECKING:
 )
 @add_worker_options
 @click.option("--status", is_flag=True, help="Only show the sweep's progress.")
-@click.option("--dry-run", is_flag=True, help="Only show the missing runs, and the expected time once data and some runs are ready.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Only show the missing runs, and the expected time if data and finished runs exist.",
+)
 @click.option("--retry", is_flag=True, help="Repeat failed runs.")
 @click.option("--again", is_flag=True, help="Train the sweep's networks again, without their prerequisites.")
 @click.option("--until-decided", is_flag=True, help="Add seeds to variants with inconclusive verdicts.")

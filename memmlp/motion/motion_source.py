@@ -77,7 +77,7 @@ class ShippedMotion:
 
         if part != "test":
             raise InputError(
-                f"{self.clip.stem}: the only clip that a shipped network has; {part} clips need a run of your own"
+                f"{self.clip.stem}: a shipped network has only this clip; {part} clips need a run of your own"
             )
         clip, _ = resample(read_clip(self.clip, self.clip.stem))
         frames = torch.from_numpy(np.concatenate(list(compute_frame_blocks(clip, self.rest))))

@@ -109,3 +109,8 @@ def test_eval_shows_the_card_and_measures_only_with_data(memmlp, tmp_path: Path)
     again = memmlp("eval", "recurrent_poser", "--again", "--outputs", str(tmp_path))
     assert again.code == 2
     assert "data.root" in again.err
+
+
+def test_a_card_has_only_branches_of_its_network(memmlp):
+    branches = {name: "| position |" in memmlp("models", name).out for name in NAMES}
+    assert branches == {"mem_mlp": True, "recurrent_poser": False}
