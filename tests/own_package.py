@@ -15,8 +15,6 @@ from memmlp.runs.identity import VERSIONS
 EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"
 PACKAGE = "memmlp_feet"
 TINY = ["profile=tiny", *SMALL, "loggers=none", "threads=1", "optim.validate_every=20"]
-KILLED = [*TINY, "optim.steps=40", "optim.checkpoint_every=5"]
-"""Overrides of a run with several checkpoints."""
 REGISTERS = (SMALLEST, UNITS, VERSIONS, HIGHER, plugins._active, components._roots)
 
 

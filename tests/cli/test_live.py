@@ -17,11 +17,9 @@ from conftest import Memmlp, one_line
 from glb import Glb
 from processes import PATIENCE, hearing_interrupts, started
 
-from memmlp.cli.live import LiveOptions, combine_calibration, load_tracked_clip
+from memmlp.cli.live import LiveOptions, load_tracked_clip
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.live.stream import Stream
-from memmlp.live.wearer import Calibration, Offsets, save_calibration
 from memmlp.motion.body import PARENTS, RECORD, describe_body, make_builtin_rest_joints
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.synthetic import synthesize_clip
@@ -100,17 +98,3 @@ def test_a_recording_is_whole_when_the_command_is_ended(step: Path, clip: Path, 
     assert len(Glb(files[1]).channels()["head", "rotation"][0]) == frames >= 5
     assert all(f"{path}: {frames / 60:.1f} s" in said for path in files)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["me.glb", "me.npz"]
-
-
-def test_a_calibration_of_another_height_is_told(step: Path, tmp_path: Path, capsys):
-    """Its offsets are of that height, would be wrong in silence, and be kept as those of the new height."""
-    stream = Stream(step)
-    worn = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
-    save_calibration(tmp_path / "me.json", Calibration("amass", worn, 1.80, 0.02), stream.network.body)
-    given = LiveOptions(str(step), tmp_path, calibration=tmp_path / "me.json")
-    known = combine_calibration(given, "amass", stream)
-    assert (known.height, known.floor, capsys.readouterr().err) == (1.80, 0.02, "")
-    assert known.offsets is not None
-    known = combine_calibration(given._replace(height=1.86, floor=0.05), "amass", stream)
-    assert (known.offsets, known.height, known.floor) == (None, 1.86, 0.05)
-    assert "1.80 m; calibrate again" in capsys.readouterr().err

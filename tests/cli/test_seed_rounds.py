@@ -166,19 +166,6 @@ def test_what_is_kept_says_that_seeds_were_spent_in_rounds(memmlp: Memmlp, runs:
     assert find_exceeding() == ["chosen", "trial"]
 
 
-@pytest.mark.slow
-def test_failed_runs_are_late_and_made_up_for(memmlp: Memmlp, runs: Runs):
-    runs.failing = {"worse"}
-    ran = memmlp(*SWEEP)
-    assert ran.code == 1
-    assert "repeat failed runs with --retry" in ran.err
-    assert "all verdicts are decided" not in ran.out
-    assert [labels for _, labels in analysed()] == [["same"]] * len(analysed())
-    runs.failing = set()
-    assert (memmlp(*SWEEP).code, memmlp(*SWEEP, "--retry").code) == (1, 0)
-    assert analysed()[-1] == (3, ["worse"])
-
-
 def test_bad_combinations_are_one_line(memmlp: Memmlp, runs: Runs):
     assert one_line(memmlp("sweep", "trial.yaml", "--max-seeds", "5"), "--max-seeds: ")
     assert one_line(memmlp(*SWEEP, "--max-seeds", "2"), "--max-seeds 2: must be at least 3")
