@@ -150,20 +150,11 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
 
 
 @pytest.mark.slow
-def test_what_is_kept_says_that_seeds_were_spent_in_rounds(memmlp: Memmlp, runs: Runs):
+def test_what_is_kept_has_the_seeds_of_all_rounds(memmlp: Memmlp, runs: Runs):
     memmlp(*SWEEP)
     memmlp("results", "save", "trial.yaml", "--name", "chosen", "seed=0,1,2")
     memmlp("results", "save", "trial.yaml")
     assert one_line(memmlp("results", "save", "trial.yaml", "seed=0,1,2"), "trial.json", "seed 3")
-
-    def find_exceeding() -> list[str]:
-        assert memmlp("results", "docs").code == 0
-        pages = {path.stem: path.read_text() for path in Path("docs/results").glob("*.md")}
-        return sorted(name for name, text in pages.items() if "exceed 5 %" in text)
-
-    assert find_exceeding() == ["chosen"]
-    write(VARIANTS, smallest={"MPJPE": 0.5})
-    assert find_exceeding() == ["chosen", "trial"]
 
 
 def test_bad_combinations_are_one_line(memmlp: Memmlp, runs: Runs):

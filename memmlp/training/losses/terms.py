@@ -227,7 +227,7 @@ class TermsLossSettings(CompleteLossSettings):
                 yield f"loss.{name}: must be null, since it needs {needed} frames, but model learns {frames}"
 
 
-TERMS = tuple(one.name for one in fields(TermsLossSettings) if one.type == "float | None")
+TERMS = tuple(one.name for one in fields(TermsLossSettings) if one.type == float | None)
 """The names of the terms: the keys that are weights."""
 
 
