@@ -178,10 +178,10 @@ def make_card(opened: OpenedRun, title: str, command: str) -> dict[str, Any]:
     parts = {p: [c for c in clips if c.split == p] for p in ("train", "val", "test")}
     files = [path for path in sorted(run.folder.rglob("*")) if path.suffix in (".onnx", ".safetensors")]
     config, manifest = run.config, run.manifest
-    recipe = {key: config["optim"][key] for key in ("name", "steps", "batch", "lr", "warmup", "best_by")}
+    recipe = {key: config["optim"][key] for key in ("name", "batch", "lr", "warmup", "best_by")}
     recipe |= {
         "frames": config["model"]["frames"],
-        **{key: manifest.get(key) for key in ("best_step", "tflop")},
+        **{key: manifest.get(key) for key in ("steps", "best_step", "tflop")},
     }
     return {
         "name": run.id,
