@@ -20,8 +20,8 @@ demo: $(STAMP)
 	$(BIN)/memmlp demo
 
 # One process more than cores, since some tests wait for other processes. They share compiled code.
-CORES := $(shell $(PYTHON) -c 'import os; print(os.cpu_count())')
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $$(($(CORES) + 1))
+CORES := $(BIN)/python -c 'from memmlp.common.processes import count_usable_cores; print(count_usable_cores())'
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $$(($$($(CORES)) + 1))
 
 test: $(STAMP)
 	$(PYTEST)

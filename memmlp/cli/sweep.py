@@ -188,6 +188,7 @@ def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, lab
     from memmlp.config.compose_plan import get_sweep_folder
     from memmlp.report.tables.build_table import write_table
     from memmlp.report.tables.measured_run import load_measured_run
+    from memmlp.runs.lookup import format_outputs_option
     from memmlp.sweep.plan import FAULTY
 
     plan, rounds = shown.plan, shown.rounds
@@ -206,7 +207,7 @@ def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, lab
     if failed:
         click.echo("repeat failed runs with --retry", err=True)
         raise SystemExit(1)
-    click.echo("next: memmlp report")
+    click.echo(f"next: {join_command(['memmlp', 'report', *format_outputs_option(plan.outputs)])}")
 
 
 def check_rounds_options(overrides: Sequence[str], until_decided: bool, max_seeds: int | None) -> None:

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import functools
 import itertools
+import os
 import pickle
 import re
 from collections.abc import Iterator, Sequence
@@ -68,6 +69,9 @@ def parse_hydra_arguments(argv: Sequence[str]) -> argparse.Namespace:
     if sum(map(bool, (args.run, args.multirun, args.cfg, args.info, args.shell_completion))) > 1:
         _raise_input_error("--run, --multirun, --cfg, --info, --shell-completion: expected only one of them")
     args.overrides = list(map(keep_text, args.overrides))
+    for name in ("config_dir", "config_path"):
+        if folder := getattr(args, name):
+            setattr(args, name, os.path.expanduser(folder))
     plugins.activate(plugins.find_named_packages(args.overrides))
     Plugins.instance().register(UserConfigs)
     register_components()

@@ -85,7 +85,7 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
     SMPL-H model."""
     if str(body) == "builtin":
         return make_builtin_rest_joints()
-    path = Path(body)
+    path = Path(body).expanduser()
     if not path.is_file():
         raise InputError(f"data.body={path}: no such file; must be builtin, or an SMPL-H model.npz")
     try:

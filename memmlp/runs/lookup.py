@@ -19,6 +19,11 @@ MINUTE = 60 * 60  # frames at 60 Hz
 LITTLE = 30 * MINUTE  # frames; `profile=small` draws 23 times as many
 
 
+def format_outputs_option(outputs: Path) -> list[str]:
+    """Return the words of a command that select this outputs folder; none for the default folder."""
+    return [] if outputs == Path("outputs") else ["--outputs", str(outputs)]
+
+
 def list_runs(outputs: Path | str) -> list[Run]:
     """Return all runs in an outputs folder, newest first."""
     folders = sorted((Path(outputs) / "runs").glob("*/"))

@@ -33,6 +33,20 @@ def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert seen == [before]
 
 
+def test_the_home_folder_in_paths(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """As the shell leaves it: in variables of services, and behind the = of an option."""
+    seen = Mock()
+    monkeypatch.setattr("memmlp.cli.train.run_training", seen)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("MEMMLP_OUTPUTS", "~/out")
+    monkeypatch.setattr(sys, "argv", ["memmlp", "train", "profile=tiny"])
+    main()
+    assert seen.call_args[0][0].paths.outputs == f"{tmp_path}/home/out"
+    for words in (["data", "show", "~/a", "--out=~/a.png"], ["train", "--config-dir=~/a"]):
+        assert one_line(memmlp(*words), f"{tmp_path}/home/a")
+    assert one_line(memmlp("data", "show", str(tmp_path), "--out=a.png", "--body=~/a"), f"{tmp_path}/home/a")
+
+
 def export(*_: object) -> None:
     """As torch's exporter, which names errors of a module whose import a Ctrl-C cut short."""
     try:

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import make_json_safe
+from memmlp.common.files import find_packaged_folder, make_json_safe
+from memmlp.common.text_formats import join_command
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.build_table import find_finished_runs, make_table
 from memmlp.report.tables.measured_run import MeasuredRun, load_measured_run
@@ -27,6 +28,7 @@ from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table_text import find_direction, make_caption, make_heading, make_legend, to_json
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, find_training_settings
+from memmlp.runs.lookup import format_outputs_option
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, load_sweep_copy
 from memmlp.sweep.plan import FAULTY, Entry, Plan, RunTask
@@ -223,7 +225,11 @@ class Sweeps:
             return run
 
         runs = find_finished_runs(sweep, find_run)
-        table = make_table(sweep, runs, rounds=rounds)
+        shipped = (find_packaged_folder("sweeps") / f"{sweep.name}.yaml").is_file()
+        words = ["memmlp", "sweep", sweep.name if shipped else f"{sweep.name}.yaml", *sweep.command_line]
+        words += [] if rounds else [f"seed={','.join(map(str, sweep.seeds))}"]
+        command = join_command([*words, *format_outputs_option(plan.outputs)])
+        table = make_table(sweep, runs, command=command, rounds=rounds)
         table = replace(table, flags=(*table.flags, *flag, *flags))
         described = describe_rounds(rounds, sweep) if rounds else None
         branches = {variant.branch for variant in sweep.variants}

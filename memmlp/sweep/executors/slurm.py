@@ -25,6 +25,7 @@ from memmlp.sweep.executors.local import HEARTBEAT, name_folder, prepare_work, r
 QUEUE_INTERVAL = 10.0  # seconds between two calls of squeue
 SILENCE = 45.0  # seconds without a heartbeat after which a worker counts as dead
 PATIENCE = 60.0  # seconds until a command of Slurm counts as failed
+HELD = "launch failed requeued held"  # Slurm's reason for a job that it does not start again by itself
 WARNING = 90  # seconds before the time limit at which a job is queued again; Slurm may be a minute early
 MIN_WARNED_MINUTES = 4  # a shorter job has no time for the warning
 KEPT_VARIABLES = (
@@ -127,14 +128,15 @@ class Queue:
             "--noheader",
             "--array",
             f"--user={os.getuid()}",
-            "--format=%i %T",
+            "--format=%i %T %r",
             *clusters,
         ]
         self.states: dict[str, str] | None = None
         self.read_time = -math.inf
 
     def find_state(self, job: str) -> str | None:
-        """Return the state of a job, such as PENDING; "" after its end, None while Slurm does not answer."""
+        """Return the state of a job with its reason, such as "PENDING Priority"; "" after the job's end, None
+        while Slurm does not answer."""
         if time.monotonic() - self.read_time > QUEUE_INTERVAL:
             lines = call_slurm(self.command)
             self.states = None if lines is None else dict(line.split(" ", 1) for line in lines if " " in line)
@@ -160,12 +162,17 @@ class Job:
         """Return whether the job waits or works.
 
         A job that Slurm lists is cancelled if its worker began and is silent: Slurm did not notice its death,
-        or has queued the job again, where it waits for minutes.
+        or has queued the job again, where it waits for minutes. A job that failed to start is also cancelled:
+        Slurm holds it for ever.
         """
         state = self.queue.find_state(self.name)
         if state == "":
             return False
-        if not self.began or state == "SUSPENDED" or self._count_silent_seconds() < SILENCE:
+        if state is not None and HELD in state:
+            self.cancel()
+            return False
+        is_suspended = state is not None and state.startswith("SUSPENDED")
+        if not self.began or is_suspended or self._count_silent_seconds() < SILENCE:
             return True
         self.cancel()
         return False

@@ -27,7 +27,9 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep, a run that trains, one that is damaged, and one whose every word looks like markup."""
     outputs = tmp_path_factory.mktemp("home") / "outputs"
     make_outputs(outputs)
-    started_run(outputs)
+    tuned = started_run(outputs)
+    name = " · ".join(f"loss.rotation_{which}=1.3385298778232695" for which in ("all", "root", "hands"))
+    tuned.write_manifest({"name": f"{name} · seed 7"})
     damaged = outputs / "runs" / ("0" * 16)
     damaged.mkdir()
     (damaged / "manifest.json").write_text("{")
@@ -83,6 +85,10 @@ def test_filter_sort_compare_and_the_address(browser: Browser, server: RunsServe
     route = browser.value("location.hash")
     go(browser, server.url, route.removeprefix("#/"), f"{NAMES}.length == 3")
     assert browser.value(NAMES) == names[::-1]
+    go(browser, server.url, "runs", "document.querySelectorAll('.runs tbody tr').length >= 9")
+    edges = "[...document.querySelectorAll('.runs tbody .state')].map(s => s.getBoundingClientRect().right)"
+    assert max(browser.value(edges)) < browser.value("innerWidth")
+    go(browser, server.url, route.removeprefix("#/"), f"{NAMES}.length == 3")
     browser.click(".runs thead input")
     browser.wait("document.querySelector('button.primary').textContent == 'Compare 3'")
     browser.click("button.primary")

@@ -1,6 +1,7 @@
 """Sweeps: how far they are, and the same verdicts as `memmlp table`."""
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +42,16 @@ def test_the_table_is_that_of_the_command(outputs: Path):
     assert shown["rows"] == json.loads(to_json(build_table.make_table(sweep, runs)))["rows"]
     cell = shown["rows"][1]["cells"]["stream"]["MPJPE"]
     assert (cell["effect"]["verdict"], cell["paper_effect"]) == ("holds", pytest.approx(-1.2))
+
+
+def test_the_command_for_missing_runs_is_of_this_sweep(outputs: Path):
+    sweep, _ = read_sweep(outputs)
+    save_sweep_copy(replace(sweep, command_line=("memory.layers=[2]",)), outputs / "sweeps" / "mine")
+    run_of(outputs, "gru", 2).marker.unlink()
+    (flag,) = (flag for flag in describe(sweeps_of(outputs))["table"]["flags"] if "fill with" in flag)
+    words = shlex.split(flag.partition("fill with: ")[2])
+    expected = ["mine.yaml", "memory.layers=[2]", "seed=0,1,2", "--outputs", str(outputs)]
+    assert words == ["memmlp", "sweep", *expected]
 
 
 def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):

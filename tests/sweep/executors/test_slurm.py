@@ -135,13 +135,23 @@ def test_a_job_lives_while_it_waits_and_while_its_heart_beats(
     (job.folder / HEARTBEAT).touch()
     assert job.alive()
     monkeypatch.setattr(slurm, "SILENCE", -1.0)
-    (cluster / "queue").write_text("42_0 SUSPENDED\n")
+    (cluster / "queue").write_text("42_0 SUSPENDED None\n")
     assert job.alive()
     assert not (cluster / "cancelled").exists()
     (cluster / "queue").write_text("42_0 RUNNING\n")
     assert not job.alive()
     assert (cluster / "cancelled").read_text() == "42_0\n"
     assert job.complaint() is None
+
+
+def test_a_job_that_slurm_holds_is_replaced(tmp_path: Path, cluster: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(slurm, "QUEUE_INTERVAL", -1.0)
+    (job,) = submit(tmp_path)
+    (cluster / "queue").write_text("42_0 PENDING Priority\n")
+    assert job.alive()
+    (cluster / "queue").write_text("42_0 PENDING launch failed requeued held\n")
+    assert not job.alive()
+    assert (cluster / "cancelled").read_text() == "42_0\n"
 
 
 def test_a_job_that_left_the_queue_has_ended(tmp_path: Path, cluster: Path, monkeypatch: pytest.MonkeyPatch):

@@ -142,7 +142,7 @@ export async function page(name, route) {
     };
     return h('tr', {},
       h('td', { class: 'pick' }, pick),
-      h('th', { scope: 'row' }, link(address('run', run.id), nameOf(run)), h('span', { class: 'id' }, run.id.slice(0, 8)), tags(run), run.note && h('span', { class: 'note', title: run.note }, run.note)),
+      h('th', { scope: 'row', title: nameOf(run) }, link(address('run', run.id), nameOf(run)), h('span', { class: 'id' }, run.id.slice(0, 8)), tags(run), run.note && h('span', { class: 'note', title: run.note }, run.note)),
       h('td', {}, status(run)), ui.columns.map(cell),
       h('td', { class: 'n faint', title: date(run.started) }, ago(run.started)), h('td', { class: 'n faint' }, duration(run.seconds)));
   }
