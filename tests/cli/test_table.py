@@ -27,7 +27,7 @@ def test_command_shows_another_branch_and_puts_clips_together(memmlp: Memmlp, pl
     assert "errors of the branch: position" in position
     assert position.count("± ") < show().count("± ")  # no rotations, no MPJRE
     assert "merged 4 groups of test clips into 3" in show("--together", "(salsa)")
-    assert one_line(memmlp("table", "14", "--together", "walk"), "--together walk: must match clips")
+    assert one_line(memmlp("table", "14", "--together", "(walk)"), "must match clips")
 
 
 def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, tmp_path: Path):

@@ -13,7 +13,6 @@ from memmlp.live.tracker_resampling import (
     TrackerFrames,
     TrackerSample,
     compute_heading,
-    make_t_pose,
     make_vertical_rotation,
 )
 from memmlp.motion.body import JOINTS, PARENTS, SPARSE_DIM
@@ -83,14 +82,6 @@ def test_a_hand_is_held_as_the_head_sees_it_and_a_head_where_it_was():
     np.testing.assert_allclose(seen, np.tile(seen[0], (61, 1)), atol=1e-9)
     positions = filled((True, False, False), 100, 60, LostTrackerFiller(SKELETON))
     np.testing.assert_array_equal(positions[100:160, 0], np.tile(PERSON.positions[99, 0], (60, 1)))
-
-
-def test_a_heading_is_the_t_poses():
-    for heading in (-3.0, -1.0, 0.0, 2.5):
-        pose = make_t_pose(SKELETON, np.zeros(3), heading)
-        assert compute_heading(pose.rotations[0]) == pytest.approx(heading)
-        left = pose.positions[1] - pose.positions[2]
-        assert np.arctan2(left[1], left[0]) == pytest.approx(heading)
 
 
 def test_features_are_those_of_training():

@@ -41,14 +41,10 @@ def test_an_index_beside_the_data_has_the_rates(tmp_path: Path) -> None:
     assert find_rate(read_bvh(path), relative, {"60": 30}).fps == 30
     assert find_rate(read_bvh(path), Path(path.name), {}).fps == 120  # the index is outside of the import
     assert find_rate(read_bvh(other), other.relative_to(tmp_path), {}).fps == 120
-    for text, said in (
-        ("Subject,framerate\n60,60\n", "has no column 'Trial #'"),
-        (header + "60,12,a,0\n", "line 2"),
-    ):
-        broken = write(tmp_path / said, person("cmu_daz", 3, 0).text(), "60_12.bvh")
-        index = write(broken.parent, text, "index.csv")
-        with refuse(index, said):
-            find_rate(read_bvh(broken), Path(broken.name), {})
+    broken = write(tmp_path / "b", person("cmu_daz", 3, 0).text(), "60_12.bvh")
+    index = write(tmp_path / "b", header + "60,12,a,0\n", "index.csv")
+    with refuse(index, "line 2"):
+        find_rate(read_bvh(broken), Path(broken.name), {})
 
 
 @pytest.mark.skipif(not SALSA.is_dir(), reason="no CMU salsa in ../shared/data")
