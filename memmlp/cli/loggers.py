@@ -29,15 +29,8 @@ def loggers() -> None:
     type=click.Choice(LOGGERS),
     help="Logger to update; repeatable.  [default: mlflow]",
 )
-@click.option(
-    "--uri",
-    default=None,
-    help="Address of MLflow's store.  [default: MLFLOW_TRACKING_URI if set, or SQLite in --outputs]",
-)
-@click.option("--project", default="memmlp", help="W&B project.")
-@click.option("--full", is_flag=True, help="Also update runs that are up to date.")
 @outputs_option
-def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outputs: Path) -> None:
+def sync(names: tuple[str, ...], outputs: Path) -> None:
     """Update loggers with all runs.
 
     Then the loggers show the same as the run folders, without duplicates. Runs in progress are skipped,
@@ -49,8 +42,8 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
 
     started = [run for run in list_runs(outputs) if run.manifest]
     warnings: list[str] = []
-    for logger in _make_loggers(names or ("mlflow",), uri, project, outputs):
-        counts = run_loggers.sync_runs(logger, progress_bar(started, logger.name), warnings.append, full)
+    for logger in _make_loggers(names or ("mlflow",), outputs):
+        counts = run_loggers.sync_runs(logger, progress_bar(started, logger.name), warnings.append)
         live = f", {counts['live']} are in progress" if counts["live"] else ""
         runs = f"{counts['shown'] + counts['same']} runs ({counts['shown']} updated now)"
         click.echo(f"{runs} are in {logger.place}{live}")
@@ -60,14 +53,14 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
         raise SystemExit(1)
 
 
-def _make_loggers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[RunLogger]:
+def _make_loggers(names: Sequence[str], outputs: Path) -> list[RunLogger]:
     from memmlp.runs.loggers.mlflow import MLflow
     from memmlp.runs.loggers.tensorboard import TensorBoard
     from memmlp.runs.loggers.wandb import WandB
 
     makers: dict[str, Callable[[], RunLogger]] = {
-        "mlflow": lambda: MLflow(uri, outputs),
+        "mlflow": lambda: MLflow(None, outputs),
         "tensorboard": lambda: TensorBoard(outputs),
-        "wandb": lambda: WandB(project, outputs),
+        "wandb": lambda: WandB("memmlp", outputs),
     }
     return [makers[name]() for name in dict.fromkeys(names)]

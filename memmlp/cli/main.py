@@ -48,7 +48,6 @@ COMMANDS = {
     "models": Command("models", "models", "List the trained networks that the package ships."),
     "web": Command("web", "web", "Make a site that runs networks in any browser."),
     "export": Command("export", "export", "Write the ONNX file of a finished run."),
-    "bench": Command("bench", "bench", "Measure speed on this machine."),
 }
 
 

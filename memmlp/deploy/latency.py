@@ -2,9 +2,9 @@
 
 import copy
 import time
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import onnx
@@ -23,22 +23,8 @@ from memmlp.networks.motion_model import MotionModel, StreamingGraph
 from memmlp.networks.vqvae import EMACodebook
 
 WARM_UP = 30  # number of untimed steps at the start
-SETTLING = 3  # number of untimed steps at the start of each round
-Key = TypeVar("Key", bound=Hashable)
 Model = TypeVar("Model", bound=MotionModel)
 YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
-
-
-class RoundTimes(NamedTuple):
-    """Step times of one file, measured in rounds with other files.
-
-    Attributes:
-        seconds: the time of each step (rounds, steps), in seconds.
-        core_fractions: the fraction of each round (rounds,) in which the thread ran on a core.
-    """
-
-    seconds: np.ndarray
-    core_fractions: np.ndarray
 
 
 def measure_step_times(path: Path, steps: int = 200) -> dict[str, Any]:
@@ -70,51 +56,6 @@ def measure_step_times(path: Path, steps: int = 200) -> dict[str, Any]:
         "steps": len(ours),
         "threads": 1,
     }
-
-
-def time_steps_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, RoundTimes]:
-    """Time the steps of exported files on one thread. Each round times all files.
-
-    The first steps of a file in each round only fill the caches, and are not counted.
-    """
-    streams = {key: OnnxStream(path) for key, path in paths.items()}
-    random = np.random.default_rng(0)
-    given = {
-        key: [np.asarray(random.normal(size=array.shape), np.float32) for array in stream.inputs.values()]
-        for key, stream in streams.items()
-    }
-
-    def time_round(key: Key) -> np.ndarray:
-        seconds = np.zeros(SETTLING + steps)
-        for step in range(len(seconds)):
-            start = time.perf_counter()
-            streams[key].step(*given[key])
-            seconds[step] = time.perf_counter() - start
-        return seconds[SETTLING:]
-
-    return time_in_rounds(paths, rounds, time_round)
-
-
-def time_in_rounds(
-    keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.ndarray]
-) -> dict[Key, RoundTimes]:
-    """Time all files in each round. The order of the files is reversed after each round.
-
-    Args:
-        keys: the keys of the files.
-        rounds: number of rounds.
-        time_round: times the steps of one file in one round, and returns the seconds (steps,).
-    """
-    order = list(keys)
-    seconds: dict[Key, list[np.ndarray]] = {key: [] for key in order}
-    shares: dict[Key, list[float]] = {key: [] for key in order}
-    for _ in range(rounds):
-        for key in order:
-            clock = CoreUsageTimer()
-            seconds[key].append(time_round(key))
-            shares[key].append(clock.fraction)
-        order.reverse()
-    return {key: RoundTimes(np.array(seconds[key]), np.array(shares[key])) for key in seconds}
 
 
 def measure_size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> dict[str, Any]:

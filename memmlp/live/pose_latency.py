@@ -1,18 +1,15 @@
 """CPU time of an end-to-end pose: from a sample of the trackers to joints in the caller's space."""
 
 import time
-from collections.abc import Hashable, Mapping
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from memmlp.common.processes import CoreUsageTimer
-from memmlp.deploy.latency import SETTLING, WARM_UP, RoundTimes, time_in_rounds
+from memmlp.deploy.latency import WARM_UP
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
 
-Key = TypeVar("Key", bound=Hashable)
 LEAST = 200  # minimum number of timed samples
 
 
@@ -28,13 +25,6 @@ def measure_pose_times(path: Path, steps: int) -> dict[str, float]:
         "pose_p95_ms": 1000 * float(np.percentile(seconds, 95)),
         "pose_core_share": clock.fraction,
     }
-
-
-def time_poses_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, RoundTimes]:
-    """Time end-to-end poses of exported networks on one thread. Each round times all files, without its first
-    poses."""
-    streams = {key: Stream(path) for key, path in paths.items()}
-    return time_in_rounds(paths, rounds, lambda key: time_poses(streams[key], SETTLING + steps)[SETTLING:])
 
 
 def time_poses(stream: Stream, count: int) -> np.ndarray:

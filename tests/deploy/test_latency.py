@@ -2,14 +2,12 @@
 
 from functools import partial
 
-import numpy as np
 import pytest
 import tiny
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from memmlp.common import processes
 from memmlp.deploy import latency
 from memmlp.deploy.latency import count_macs, strip_conversions
 from memmlp.motion.body import MOTION_DIM, POSITION, ROTATION, SPARSE_DIM
@@ -55,25 +53,6 @@ def test_latency_and_size(naive_step, small_yardstick, monkeypatch):
     clock = iter([5.0, 5.0 + 1e-9])  # a thread without a core
     monkeypatch.setattr(latency.time, "thread_time", lambda: next(clock))
     assert latency.measure_step_times(path, steps=1)["core_share"] < 1e-6
-
-
-def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(monkeypatch):
-    """By clocks of the test's own: a step is 2 s, and the second round's `b` waits 6 s more for a core."""
-    clock, order = {"passed": 0.0, "busy": 0.0}, []
-    monkeypatch.setattr(processes.time, "perf_counter", lambda: clock["passed"])
-    monkeypatch.setattr(processes.time, "thread_time", lambda: clock["busy"])
-
-    def time_round(key):
-        order.append(key)
-        clock["busy"] += 2
-        clock["passed"] += 8 if order == ["a", "b", "b"] else 2
-        return np.array([2.0])
-
-    found = latency.time_in_rounds("ab", 3, time_round)
-    assert order == ["a", "b", "b", "a", "a", "b"]
-    assert found["a"].core_fractions.tolist() == [1, 1, 1]
-    assert found["b"].core_fractions.tolist() == [1, 0.25, 1]
-    assert found["b"].seconds.tolist() == [[2], [2], [2]]
 
 
 def test_macs_are_counted_by_hand():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from memmlp.live.pose_latency import measure_pose_times, time_poses_in_rounds
+from memmlp.live.pose_latency import measure_pose_times
 
 pytestmark = pytest.mark.slow
 
@@ -12,5 +12,3 @@ def test_a_whole_pose_is_timed(step_files):
     found = measure_pose_times(file, 1)
     assert 0 < found["pose_median_ms"] <= found["pose_p95_ms"]
     assert 0 < found["pose_core_share"] < 1.01
-    (times,) = time_poses_in_rounds({"one": file}, 2, 3).values()
-    assert (times.seconds.shape, times.core_fractions.shape) == ((2, 3), (2,))

@@ -297,18 +297,15 @@ def _format_error(error: BaseException) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def sync_runs(
-    logger: RunLogger, runs: Iterable[Run], report: Callable[[str], None], full: bool = False
-) -> Counter[str]:
-    """Update a logger with the content of each run's folder; `report` gets a line about each failure. With
-    `full`, runs that are up to date are sent again. Return how many runs were "shown", up to date ("same"),
-    in progress ("live", skipped) and "failed"."""
+def sync_runs(logger: RunLogger, runs: Iterable[Run], report: Callable[[str], None]) -> Counter[str]:
+    """Update a logger with the content of each run's folder; `report` gets a line about each failure. Return
+    how many runs were "shown", up to date ("same"), in progress ("live", skipped) and "failed"."""
     counts: Counter[str] = Counter()
     for run in runs:
         try:
             if run.activity:
                 counts["live"] += 1
-            elif not full and logger.fingerprint(run.id) == read_run_facts(run).fingerprint:
+            elif logger.fingerprint(run.id) == read_run_facts(run).fingerprint:
                 counts["same"] += 1
             else:
                 Session(logger, run).end()

@@ -107,7 +107,6 @@ def test_a_sync_shows_what_changed_once(tmp_path: Path):
     assert logger.server.status == {runs[0].id: "done", runs[1].id: "failed"}
     add_tags(runs[0], ["good"])
     assert sync_runs(logger, runs, said.append) == {"shown": 1, "same": 1}
-    assert sync_runs(logger, runs, said.append, full=True) == {"shown": 2}
     logger.server.fingerprints.clear()
     assert sync_runs(logger, runs, said.append) == {"shown": 2}
     assert (logger.server.values, said) == ({run.id: losses(3) for run in runs}, [])

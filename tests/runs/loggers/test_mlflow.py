@@ -139,7 +139,9 @@ def test_any_folder_and_any_tag(tmp_path: Path, name: str):
 
 def test_a_deleted_experiment_is_restored_without_replaced_runs(tmp_path: Path):
     logger, run = MLflow(None, tmp_path), a_run(tmp_path)
-    sync_runs(logger, [run, run], print, full=True)
+    sync_runs(logger, [run], print)
+    add_tags(run, ["again"])
+    sync_runs(logger, [run], print)
     with logger.client() as (client, experiment):
         client.delete_experiment(experiment)
     assert sync_runs(logger, [run], print) == {"shown": 1}

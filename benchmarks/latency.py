@@ -1,20 +1,38 @@
-"""`memmlp bench`: time network steps, poses and training steps on this machine."""
+"""Time a step of each network in ONNX Runtime: the bare network, the deployed step and the end-to-end pose.
 
-from __future__ import annotations
+Run `python benchmarks/latency.py --rounds 9 --json FILE`; docs/results/latency.md has the output.
+"""
 
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple, TypeVar
 
 import click
+import numpy as np
+import torch
+from rich.table import Table
 
 from memmlp.cli.options import PATH, config_dir_option, plugins_option
+from memmlp.common.errors import InputError
+from memmlp.common.files import write_json
+from memmlp.common.processes import CoreUsageTimer
+from memmlp.common.progress import progress_bar
+from memmlp.common.text_formats import make_console
+from memmlp.config.build import build_untrained
+from memmlp.deploy.export import export
+from memmlp.deploy.latency import strip_conversions
+from memmlp.deploy.lower_precision import write_lower_precision
+from memmlp.deploy.onnx_stream import OnnxStream
+from memmlp.live.pose_latency import time_poses
+from memmlp.live.stream import Stream
+from memmlp.motion.body import FRAME_DIM
+from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
+from memmlp.runs.environment import describe_environment
 
-if TYPE_CHECKING:
-    from memmlp.deploy.latency import RoundTimes
-    from memmlp.training.step_cost import StepCost
-
+SETTLING = 3  # number of untimed steps at the start of each round
+Key = TypeVar("Key", bound=Hashable)
 BASE = "avatar_poser"
 """The reference network of all ratios, with its default size."""
 DEFAULT_MODELS = (
@@ -26,12 +44,71 @@ DEPLOYED = ("naive", "streaming", *LOWER_PRECISIONS)
 GRAPHS = ("network", *DEPLOYED)
 
 
-@click.group("bench")
-def bench() -> None:
-    """Measure speed on this machine."""
+class RoundTimes(NamedTuple):
+    """Step times of one file, measured in rounds with other files.
+
+    Attributes:
+        seconds: the time of each step (rounds, steps), in seconds.
+        core_fractions: the fraction of each round (rounds,) in which the thread ran on a core.
+    """
+
+    seconds: np.ndarray
+    core_fractions: np.ndarray
 
 
-@bench.command("latency")
+def time_steps_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, RoundTimes]:
+    """Time the steps of exported files on one thread. Each round times all files.
+
+    The first steps of a file in each round only fill the caches, and are not counted.
+    """
+    streams = {key: OnnxStream(path) for key, path in paths.items()}
+    random = np.random.default_rng(0)
+    given = {
+        key: [np.asarray(random.normal(size=array.shape), np.float32) for array in stream.inputs.values()]
+        for key, stream in streams.items()
+    }
+
+    def time_round(key: Key) -> np.ndarray:
+        seconds = np.zeros(SETTLING + steps)
+        for step in range(len(seconds)):
+            start = time.perf_counter()
+            streams[key].step(*given[key])
+            seconds[step] = time.perf_counter() - start
+        return seconds[SETTLING:]
+
+    return time_in_rounds(paths, rounds, time_round)
+
+
+def time_in_rounds(
+    keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.ndarray]
+) -> dict[Key, RoundTimes]:
+    """Time all files in each round. The order of the files is reversed after each round.
+
+    Args:
+        keys: the keys of the files.
+        rounds: number of rounds.
+        time_round: times the steps of one file in one round, and returns the seconds (steps,).
+    """
+    order = list(keys)
+    seconds: dict[Key, list[np.ndarray]] = {key: [] for key in order}
+    shares: dict[Key, list[float]] = {key: [] for key in order}
+    for _ in range(rounds):
+        for key in order:
+            clock = CoreUsageTimer()
+            seconds[key].append(time_round(key))
+            shares[key].append(clock.fraction)
+        order.reverse()
+    return {key: RoundTimes(np.array(seconds[key]), np.array(shares[key])) for key in seconds}
+
+
+def time_poses_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, RoundTimes]:
+    """Time end-to-end poses of exported networks on one thread. Each round times all files, without its first
+    poses."""
+    streams = {key: Stream(path) for key, path in paths.items()}
+    return time_in_rounds(paths, rounds, lambda key: time_poses(streams[key], SETTLING + steps)[SETTLING:])
+
+
+@click.command(context_settings={"show_default": True})
 @click.option("--rounds", default=5, type=click.IntRange(5), help="Number of timed rounds.")
 @click.option("--steps", default=20, type=click.IntRange(2), help="Number of steps per round.")
 @click.option(
@@ -54,7 +131,6 @@ def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: 
     affect the times. Ratios compare the medians of each round: steps with AvatarPoser's bare network, and
     poses with AvatarPoser's pose.
     """
-    from memmlp.common.errors import InputError
 
     chosen = [name.strip() for name in models.split(",")]
     if BASE not in chosen:
@@ -67,9 +143,6 @@ def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: 
         rows = time_all(dict(export_all(chosen, overrides, Path(folder))), rounds, steps)
     show(rows, rounds)
     if file:
-        from memmlp.common.files import write_json
-        from memmlp.runs.environment import describe_environment
-
         how = {"overrides": list(overrides), "rounds": rounds, "steps": steps, "threads": 1}
         write_json(file, {**how, "made_by": describe_environment(), "rows": rows})
 
@@ -78,15 +151,6 @@ def export_all(
     models: list[str], overrides: tuple[str, ...], folder: Path
 ) -> Iterator[tuple[tuple[str, str], Path]]:
     """Export each model's graphs, with a progress bar, and yield pairs of (model, graph) and file."""
-    import torch
-
-    from memmlp.common.progress import progress_bar
-    from memmlp.config.build import build_untrained
-    from memmlp.deploy.export import export
-    from memmlp.deploy.latency import strip_conversions
-    from memmlp.deploy.lower_precision import write_lower_precision
-    from memmlp.motion.body import FRAME_DIM
-    from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 
     clips = [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
     for name in progress_bar(models, "exporting"):
@@ -106,8 +170,6 @@ def export_all(
 
 def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
     """Time the steps of all files in turn, then the end-to-end poses of deployed files; see `summarize`."""
-    from memmlp.deploy.latency import time_steps_in_rounds
-    from memmlp.live.pose_latency import time_poses_in_rounds
 
     times = time_steps_in_rounds(paths, rounds, steps)
     deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}
@@ -124,8 +186,6 @@ def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, flo
     """Summarize a file's times, under keys with this prefix: median and 95th percentile in milliseconds; the
     ratio of its median to the reference file's: median, minimum and maximum over the rounds; and the minimum,
     over the rounds, of the fraction of time in which the thread had a core."""
-    import numpy as np
-
     ratios = np.median(times.seconds, 1) / np.median(base.seconds, 1)
     return {
         f"{prefix}median_ms": 1000 * float(np.median(times.seconds)),
@@ -139,9 +199,6 @@ def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, flo
 
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
     """Print the rows as a table with one line per row, 80 characters wide."""
-    from rich.table import Table
-
-    from memmlp.common.text_formats import make_console
 
     print(f"milliseconds on one thread; each of {rounds} rounds times all networks")
     print("x: the time divided by AvatarPoser's time, for the network or for the whole pose")
@@ -170,62 +227,5 @@ def shorten_number(number: float) -> str:
     return f"{number:.2f}" if number < 10 else f"{number:.1f}" if number < 100 else f"{number:.0f}"
 
 
-@bench.command("train")
-@click.option("--rounds", default=5, type=click.IntRange(1), help="Number of timed rounds.")
-@click.option("--steps", default=10, type=click.IntRange(1), help="Number of steps per round.")
-@click.option("--profile", "kernels", is_flag=True, help="Also print the slowest functions of torch.")
-@click.argument("overrides", nargs=-1)
-@config_dir_option
-@plugins_option
-def train(rounds: int, steps: int, kernels: bool, overrides: tuple[str, ...]) -> None:
-    """Time a training step, and its matrix products alone.
-
-    OVERRIDES are those of `memmlp train`. The step runs on one thread of the CPU; times are processor times.
-    Each round times some steps, then the same matrix products by themselves. A VQ-VAE has random weights,
-    which does not affect the times; other prerequisite runs are trained if they are missing.
-    """
-    import numpy as np
-
-    cost = measure_training_step(overrides, rounds, steps, kernels)
-    step, products, ratio = map(np.median, (cost.step_ms, cost.product_ms, cost.ratios))
-    print(f"milliseconds on one thread, median of {rounds} rounds of {steps} steps")
-    print(f"{step:8.2f} training step")
-    print(f"{products:8.2f} its matrix products alone, {cost.flops / 1e9:.3g} GFLOP")
-    print(f"{ratio:8.2f} times the products, from {cost.ratios.min():.2f} to {cost.ratios.max():.2f}")
-    for name, milliseconds, calls in cost.kernels[:20]:
-        print(f"{milliseconds:8.2f} {name}, {calls:g} calls")
-
-
-def measure_training_step(
-    overrides: tuple[str, ...], rounds: int, steps: int, with_kernels: bool
-) -> StepCost:
-    """Measure the training step that overrides configure; see `measure_step_cost`."""
-    import torch
-
-    from memmlp.common.errors import InputError
-    from memmlp.config.build import build_experiment
-    from memmlp.config.compose import compose_config
-    from memmlp.networks import checkpoint
-    from memmlp.training.run_stages import make_prerequisites
-    from memmlp.training.step_cost import measure_step_cost
-    from memmlp.training.train_network import NetworkTraining
-
-    experiment = build_experiment(compose_config(overrides))
-    training, architecture = experiment.training, experiment.architecture
-    if experiment.device.type != "cpu":
-        raise InputError(f"device={experiment.config['device']}: must be cpu, whose time is measured")
-    if not isinstance(training, NetworkTraining):
-        raise InputError("refiner: must be null, since the steps of a network's training are timed")
-    training.optim.check_installed()
-    data = experiment.motion.prepare()
-    with tempfile.TemporaryDirectory() as folder:
-        weights = None
-        if architecture.uses_codes:
-            torch.manual_seed(0)
-            weights = Path(folder) / "vqvae.safetensors"
-            codes = checkpoint.collect_module_tensors("model", architecture.vqvae())
-            checkpoint.write(weights, codes, {})
-        elif run := make_prerequisites(experiment, data):
-            weights = run.weights()
-        task = training.make_task(architecture, data, weights, experiment.device)
-    return measure_step_cost(task, training.optim, rounds, steps, with_kernels)
+if __name__ == "__main__":
+    latency()

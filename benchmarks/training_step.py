@@ -1,19 +1,32 @@
-"""The cost of a training step: its processor time, and the time of its matrix products alone."""
+"""Time a training step on one thread of the CPU, and its matrix products alone.
 
+Run `python benchmarks/training_step.py OVERRIDES`, with the overrides of `memmlp train`.
+"""
+
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import torch
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
+from memmlp.cli.options import config_dir_option, plugins_option
+from memmlp.common.errors import InputError
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import compose_config
 from memmlp.motion.geometry import limit_to_one_thread
+from memmlp.networks import checkpoint
 from memmlp.training.loop import TrainingTask, seed_step, train_step
 from memmlp.training.optim import Optim
+from memmlp.training.run_stages import make_prerequisites
+from memmlp.training.train_network import NetworkTraining
 
 WARM_UP = 3  # steps before the first round; torch.compile works in the first one
 
@@ -104,3 +117,57 @@ def time_call(call: Callable[[], None]) -> float:
     started = time.thread_time()
     call()
     return time.thread_time() - started
+
+
+@click.command(context_settings={"show_default": True})
+@click.option("--rounds", default=5, type=click.IntRange(1), help="Number of timed rounds.")
+@click.option("--steps", default=10, type=click.IntRange(1), help="Number of steps per round.")
+@click.option("--profile", "kernels", is_flag=True, help="Also print the slowest functions of torch.")
+@click.argument("overrides", nargs=-1)
+@config_dir_option
+@plugins_option
+def train(rounds: int, steps: int, kernels: bool, overrides: tuple[str, ...]) -> None:
+    """Time a training step, and its matrix products alone.
+
+    OVERRIDES are those of `memmlp train`. The step runs on one thread of the CPU; times are processor times.
+    Each round times some steps, then the same matrix products by themselves. A VQ-VAE has random weights,
+    which does not affect the times; other prerequisite runs are trained if they are missing.
+    """
+    cost = measure_training_step(overrides, rounds, steps, kernels)
+    step, products, ratio = map(np.median, (cost.step_ms, cost.product_ms, cost.ratios))
+    print(f"milliseconds on one thread, median of {rounds} rounds of {steps} steps")
+    print(f"{step:8.2f} training step")
+    print(f"{products:8.2f} its matrix products alone, {cost.flops / 1e9:.3g} GFLOP")
+    print(f"{ratio:8.2f} times the products, from {cost.ratios.min():.2f} to {cost.ratios.max():.2f}")
+    for name, milliseconds, calls in cost.kernels[:20]:
+        print(f"{milliseconds:8.2f} {name}, {calls:g} calls")
+
+
+def measure_training_step(
+    overrides: tuple[str, ...], rounds: int, steps: int, with_kernels: bool
+) -> StepCost:
+    """Measure the training step that overrides configure; see `measure_step_cost`."""
+
+    experiment = build_experiment(compose_config(overrides))
+    training, architecture = experiment.training, experiment.architecture
+    if experiment.device.type != "cpu":
+        raise InputError(f"device={experiment.config['device']}: must be cpu, whose time is measured")
+    if not isinstance(training, NetworkTraining):
+        raise InputError("refiner: must be null, since the steps of a network's training are timed")
+    training.optim.check_installed()
+    data = experiment.motion.prepare()
+    with tempfile.TemporaryDirectory() as folder:
+        weights = None
+        if architecture.uses_codes:
+            torch.manual_seed(0)
+            weights = Path(folder) / "vqvae.safetensors"
+            codes = checkpoint.collect_module_tensors("model", architecture.vqvae())
+            checkpoint.write(weights, codes, {})
+        elif run := make_prerequisites(experiment, data):
+            weights = run.weights()
+        task = training.make_task(architecture, data, weights, experiment.device)
+    return measure_step_cost(task, training.optim, rounds, steps, with_kernels)
+
+
+if __name__ == "__main__":
+    train()
