@@ -70,26 +70,27 @@ def matrix_to_sixd(matrix: Tensor) -> Tensor:
 
 def sixd_to_matrix(sixd: Tensor) -> Tensor:
     """Convert 6D (..., 6) to matrices (..., 3, 3) by Gram-Schmidt. Any two columns that are not zero and not
-    parallel give a rotation."""
-    first = F.normalize(sixd[..., :3], dim=-1)
-    second = sixd[..., 3:]
-    second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second, dim=-1)], -1)
+    parallel give a rotation. Each component is a tensor of its own, which is fast for many rotations."""
+    a, b, c, d, e, f = sixd.movedim(-1, 0).contiguous().unbind()
+    a, b, c = _normalize(a, b, c)
+    along = a * d + b * e + c * f
+    d, e, f = _normalize(d - along * a, e - along * b, f - along * c)
+    columns = [a, b, c, d, e, f, b * f - c * e, c * d - a * f, a * e - b * d]
+    return torch.stack(columns).unflatten(0, (3, 3)).movedim((1, 0), (-2, -1))
+
+
+def _normalize(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    square = torch.addcmul(torch.addcmul(x * x, y, y), z, z)
+    size = square.clamp_min(1e-24).sqrt()  # 1e-12 at least, as in F.normalize
+    return x / size, y / size, z / size
 
 
 def compute_geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
     """Return the angle (...) in [0, pi] between rotations (..., 3, 3); accurate at 0 and at pi."""
-    relative = a.transpose(-1, -2) @ b
-    skew = torch.stack(
-        [
-            relative[..., 2, 1] - relative[..., 1, 2],
-            relative[..., 0, 2] - relative[..., 2, 0],
-            relative[..., 1, 0] - relative[..., 0, 1],
-        ],
-        -1,
-    )
-    trace = relative.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.atan2(skew.norm(dim=-1), trace - 1)
+    relative = (a.transpose(-1, -2) @ b).flatten(-2)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = relative.unbind(-1)
+    skew = torch.stack([zy - yz, xz - zx, yx - xy], -1)
+    return torch.atan2(skew.norm(dim=-1), xx + yy + zz - 1)
 
 
 def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:

@@ -78,37 +78,42 @@ class Heading(HeadRelative):
         return torch.cat([super().find_origin(sparse), heading], -1)
 
     def convert_inputs_to_local(self, sparse: Tensor, origin: Tensor) -> Tensor:
-        sparse = super().convert_inputs_to_local(sparse, origin[..., :3])
         rotated = [
             _turn_vectors(sparse[..., SPARSE_ROTATION], origin, -1),
             sparse[..., SPARSE_ANGULAR_VELOCITY],
-            _turn_vectors(sparse[..., SPARSE_POSITION], origin, -1),
+            _turn_vectors(sparse[..., SPARSE_POSITION], origin, -1, are_points=True),
             _turn_vectors(sparse[..., SPARSE_VELOCITY], origin, -1),
         ]
         return torch.cat(rotated, -1)
 
     def convert_motion_to_local(self, motion: Tensor, origin: Tensor) -> Tensor:
-        return self._turn_motion(super().convert_motion_to_local(motion, origin[..., :3]), origin, -1)
+        return self._turn_motion(motion, origin, -1)
 
     def convert_motion_to_world(self, motion: Tensor, origin: Tensor) -> Tensor:
-        return super().convert_motion_to_world(self._turn_motion(motion, origin, 1), origin[..., :3])
+        return self._turn_motion(motion, origin, 1)
 
     def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
         return _turn_vectors(rotations, origin, 1)
 
     def _turn_motion(self, motion: Tensor, origin: Tensor, way: int) -> Tensor:
         """Turn the root's rotation and the positions. Other rotations are local and stay unchanged."""
-        root, body = motion[..., :6], motion[..., 6 : ROTATION.stop]
-        return torch.cat(
-            [_turn_vectors(root, origin, way), body, _turn_vectors(motion[..., POSITION], origin, way)], -1
-        )
+        root, body, positions = motion.split([6, ROTATION.stop - 6, MOTION_DIM - ROTATION.stop], -1)
+        positions = _turn_vectors(positions, origin, way, are_points=True)
+        return torch.cat([_turn_vectors(root, origin, way), body, positions], -1)
 
 
-def _turn_vectors(vectors: Tensor, origin: Tensor, way: int) -> Tensor:
-    """Turn vectors (..., 3 n) about the vertical by an origin's heading (..., 5), or back for `way` -1."""
+def _turn_vectors(vectors: Tensor, origin: Tensor, way: int, are_points: bool = False) -> Tensor:
+    """Turn vectors (..., 3 n) about the vertical by an origin's heading (..., 5), or back for `way` -1.
+    Points also move by its position."""
     x, y, z = vectors.unflatten(-1, (-1, 3)).unbind(-1)
-    cosine, sine = origin[..., 3:4], way * origin[..., 4:5]
-    return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1).flatten(-2)
+    *place, cosine, sine = origin.split(1, -1)
+    sine = way * sine
+    if are_points and way < 0:
+        x, y, z = (one - by for one, by in zip((x, y, z), place, strict=True))
+    x, y = cosine * x - sine * y, sine * x + cosine * y
+    if are_points and way > 0:
+        x, y, z = (one + by for one, by in zip((x, y, z), place, strict=True))
+    return torch.stack([x, y, z], -1).flatten(-2)
 
 
 def _place_points(point: Tensor, place: slice, size: int) -> Tensor:
