@@ -89,9 +89,13 @@ def format_card(card: Mapping[str, Any]) -> Iterator[str]:
         )
     )
     if others := card.get("candidates"):
-        yield "- Chosen by validation MPJPE from trainings with and without mirrored windows: " + "; ".join(
-            f"{one['tflop']:g} TFLOP{' mirrored' * one['mirror']} {one['validation MPJPE']:.2f} cm"
-            for one in others
+        yield (
+            "- Chosen by validation MPJPE from trainings with and without mirrored windows: "
+            + "; ".join(
+                f"{one['tflop']:g} TFLOP{' mirrored' * one['mirror']} {one['validation MPJPE']:.2f} cm"
+                for one in others
+            )
+            + "."
         )
     yield f"- Size: {card['parameters'] / 1e6:.2f} M parameters, {card['weights']}."
     if latency["core_share"] < MIN_CORE_FRACTION:
