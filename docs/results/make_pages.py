@@ -11,7 +11,6 @@ import contextlib
 import itertools
 import json
 import sys
-import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -36,6 +35,7 @@ from memmlp.report.tables.table_text import (
     add_unit,
     describe_branches,
     describe_power,
+    explain_marks,
     find_unit,
     format_counts,
     format_effect,
@@ -53,14 +53,19 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent
 MARK = "<!-- made by: docs/results/make_pages.py -->"
 FILES = "tables"  # folder of the CSV files and the remarks, below the folder of the pages
-MAX_REMARK = 160  # maximum length of a remark on a page, characters
+MAX_REMARK = 160  # maximum length of a remark with a list of variants on a page, characters
 ORIGIN = {
     "code": "commit", "torch": "torch", "hardware": "processor", "device": "device", "gpu": "GPU",
     "threads": "threads", "precision": "precision", "data": "data", "body": "body",
 }  # fmt: skip
 BRANCHES = {"": "branch that the paper prints", "rotation": "rotation branch", "position": "position branch"}
 UNDECIDED = (Verdict.INCONCLUSIVE, Verdict.EQUIVALENT)
-RATIO = "ratio"  # column of a step's time over the time of a fixed network
+RATIO = "ratio"  # column of a step's time over the yardstick's time
+TIME_COLUMNS = {
+    "network ms": "*network ms*: features in, the network's outputs out.",
+    "pose ms": "*pose ms*: from the trackers to the avatar's joints.",
+    RATIO: "The yardstick is a fixed chain of matrix products, timed in turn with the step.",
+}  # explanations of columns
 
 
 class KeptTable(NamedTuple):
@@ -122,13 +127,23 @@ def _make_page(name: str, source: KeptTable) -> str:
         parts.append(f"![Error against compute and latency, with 95 % intervals]({name}_frontier.svg)")
     parts.append(_make_series_table(source) if _has_cells(table) else _make_short_table(source))
     if remarks := _list_number_remarks(table):
-        short = (textwrap.shorten(one, MAX_REMARK, placeholder=" …") for one in remarks)
-        parts.append("\n".join(f"- {escape_markdown(one)}" for one in short))
+        parts.append("\n".join(f"- {shorten_remark(one)}" for one in remarks))
+    content = (
+        f"{' and '.join(table.modes)} mode, all branches and sources of test clips, with intervals and power"
+    )
     parts.append(
-        f"[All numbers]({FILES}/{name}.csv): every mode, branch and source of test clips, with intervals. "
+        f"[All numbers]({FILES}/{name}.csv){f': {content}' if table.measured_metrics else ''}. "
         f"[Remarks]({FILES}/remarks.json): commits, machines, settings."
     )
     return "\n\n".join(parts) + "\n"
+
+
+def shorten_remark(remark: str) -> str:
+    """Return a remark; a long one without its list of variants, which is in the file of remarks."""
+    head, listed, _ = remark.partition(": '")
+    if listed and len(remark) > MAX_REMARK:
+        return f"{escape_markdown(head)} ([variants]({FILES}/remarks.json))"
+    return escape_markdown(remark)
 
 
 def _describe_table(source: KeptTable) -> Iterator[str]:
@@ -139,6 +154,9 @@ def _describe_table(source: KeptTable) -> Iterator[str]:
     groups = max((row.groups for row in table.rows), default=0)
     tested = f", tested on clips in {groups} groups" if groups else ""
     yield f"`{make_command(kept)}`: {runs}{tested}."
+    if marks := explain_marks(table):
+        yield f"Beside the paper's differences: {marks}."
+    yield from (text for metric, text in TIME_COLUMNS.items() if metric in table.metrics)
     if not table.measured_metrics:
         return
     yield f"Mode: {table.modes[0]}; {escape_markdown(describe_branches(table))}."
@@ -148,11 +166,11 @@ def _describe_table(source: KeptTable) -> Iterator[str]:
         if table.comparisons:
             yield f"Verdicts are corrected for this page's {table.comparisons} comparisons."
         yield from _count_by_branch(table)
-        if power := describe_power(table, table.modes[0]):
+        if table.number and (power := describe_power(table, table.modes[0])):
             yield f"{power[0].upper()}{power[1:]}."
     for reason in dict.fromkeys(row.confounded for row in table.rows if row.confounded):
         labels = dict.fromkeys(row.series or row.label for row in table.rows if row.confounded == reason)
-        yield escape_markdown(f"{CONFOUNDED} {join_quoted(labels)} confounded: {reason}.")
+        yield escape_markdown(f"{CONFOUNDED} Confounded: {join_quoted(labels)} ({reason}).")
 
 
 def _count_by_branch(table: Table) -> Iterator[str]:
@@ -170,7 +188,8 @@ def _name_control(table: Table) -> str:
     """Name what differences on a page are from."""
     if _has_cells(table):
         series = next(row.series for row in table.rows if row.label == table.control)
-        return f"'{escape_markdown(series)}' in the same line (for itself, in the first line)"
+        name = f"'{escape_markdown(series)}'"
+        return f"{name} in the same line, and in the column of {name} from the first line,"
     if _has_several_controls(table):
         return "the variant under 'compared with'"
     return f"'{escape_markdown(table.control)}'"
@@ -214,7 +233,7 @@ def _make_column_heading(source: KeptTable, metric: str) -> str:
     head = make_heading(metric)
     if metric == "Jitter" and (truths := _find_true_jitter(source)):
         return head.replace("]", f"; truth {' or '.join(truths)}{' by test clips' * (len(truths) > 1)}]")
-    return head.replace(RATIO, "step time / fixed network's") if metric == RATIO else head
+    return head.replace(RATIO, "step time / yardstick's") if metric == RATIO else head
 
 
 def _find_true_jitter(source: KeptTable) -> list[str]:
@@ -340,19 +359,21 @@ class Placeholders:
 
     def __init__(self, sources: Mapping[str, KeptTable]):
         self.sources = sources
+        self._regrouped: dict[tuple[str, tuple[str, ...]], Table] = {}
 
     def collect_functions(self) -> dict[str, object]:
         """Return the functions by name, and the list `names` of all results."""
         methods = {name: getattr(self, name) for name in dir(self) if not name.startswith("_")}
         return {**methods, "names": sorted(self.sources)}
 
-    def claims(self, names: Sequence[str], mode: str = "stream") -> str:
+    def claims(self, names: Sequence[str], joined: str = "", mode: str = "stream") -> str:
         """Return a table with the verdicts on the paper's effects: a line for each table, a column a branch.
 
         Only effects with a sign in the paper count. Confounded rows count apart, after their mark.
 
         Args:
             names: the names of the tables' results.
+            joined: a regular expression; clips with equal matches are one group in an additional last line.
             mode: the mode of evaluation.
         """
         lines = []
@@ -361,26 +382,42 @@ class Placeholders:
             cells = [self._count_claims([table], mode, branch) for branch in BRANCHES]
             lines.append([f"[{escape_markdown(make_caption(table))}]({name}.md)", *cells])
         heads = ["table", *BRANCHES.values()]
-        total = [self._count_claims(map(self._find_table, names), mode, one) for one in BRANCHES]
-        return _make_markdown_table(heads, [*lines, ["all", *total]])
+        for label, pattern in {"all": "", "all, contents joined": joined}.items():
+            if pattern or label == "all":
+                tables = [self._find_table(name, pattern) for name in names]
+                lines.append([label, *(self._count_claims(tables, mode, branch) for branch in BRANCHES)])
+        return _make_markdown_table(heads, lines)
 
     def decisions(
-        self, names: Sequence[str], verdict: str, mode: str = "stream", confounded: bool = False
+        self,
+        names: Sequence[str],
+        verdict: str,
+        mode: str = "stream",
+        confounded: bool = False,
+        joined: str = "",
+        above_margin: bool = False,
     ) -> str:
         """Return the effects with a verdict such as `holds`, in the branch that the paper prints.
 
-        They are those of rows that are not confounded, or only of confounded rows.
+        Args:
+            names: the names of the tables' results.
+            verdict: the verdict.
+            mode: the mode of evaluation.
+            confounded: whether to list only confounded rows, instead of all other rows.
+            joined: a regular expression; clips with equal matches are one group.
+            above_margin: whether the paper's own effect must exceed the smallest effect of interest.
         """
         found: dict[str, list[str]] = {}
         for name in names:
-            table = self._find_table(name)
+            table = self._find_table(name, joined)
             for row, metric, cell, effect in table.list_effects(mode):
-                if effect.verdict == verdict and cell.paper_effect and bool(row.confounded) == confounded:
+                small = abs(cell.paper_effect or 0) <= above_margin * table.smallest.get(metric, 0)
+                if effect.verdict == verdict and not small and bool(row.confounded) == confounded:
                     found.setdefault(f"Table {table.number} '{row.label}'", []).append(metric)
         return escape_markdown("; ".join(f"{row}: {', '.join(metrics)}" for row, metrics in found.items()))
 
     def overview(self, *patterns: str) -> str:
-        """Return a table of all pages: runs, seeds, and how many differences are significant.
+        """Return a table of all pages: runs, seeds, and significant differences in the first mode.
 
         Args:
             patterns: regular expressions; with equal matches of a pattern, clips become one group in the
@@ -394,12 +431,12 @@ class Placeholders:
             seeds = sorted({len(row.found) for row in source.table.rows if row.found})
             coarse = MISSING
             with contextlib.suppress(InputError):  # no clips to merge
-                coarse = self._count_significant(source.regroup(patterns)) if source.regroup else MISSING
+                coarse = self._count_significant(self._regroup(name, patterns)) if source.regroup else MISSING
             caption = f"{caption} ({name})" if captions.count(caption) > 1 else caption
             link = f"[{escape_markdown(caption)}]({name}.md)"
             numbers = [str(source.kept.run_count), " to ".join(map(str, sorted({*seeds[:1], *seeds[-1:]})))]
             lines.append([link, *numbers, self._count_significant(source.table), coarse])
-        heads = ["page", "runs", "seeds", "significant differences", "the same with styles joined"]
+        heads = ["page", "runs", "seeds", "significant differences", "the same with contents joined"]
         return _make_markdown_table(heads, lines)
 
     def leaders(self, names: Sequence[str], metric: str, cost: str, mode: str = "stream") -> str:
@@ -429,16 +466,25 @@ class Placeholders:
 
     def _count_significant(self, table: Table) -> str:
         counts = [Counter[bool](), Counter[bool]()]
-        for row, *_, effect in (one for mode in table.modes for one in table.list_effects(mode)):
+        for row, *_, effect in table.list_effects(table.modes[0]):
             counts[bool(row.confounded)][effect.verdict not in UNDECIDED] += 1
         sound, apart = (f"{found[True]} of {found.total()}" for found in counts)
         return f"{sound}; {CONFOUNDED} {apart}" if counts[1] else sound
 
-    def _find_table(self, name: str) -> Table:
+    def _find_table(self, name: str, joined: str = "") -> Table:
         if name not in self.sources:
             choices = ", ".join(sorted(self.sources)) or "none"
             raise InputError(f"'{name}': results must be one of {choices}")
-        return self.sources[name].table
+        return self._regroup(name, (joined,)) if joined else self.sources[name].table
+
+    def _regroup(self, name: str, patterns: tuple[str, ...]) -> Table:
+        """Return a table with coarser clip groups, which takes seconds to compute, at most once."""
+        regroup = self.sources[name].regroup
+        if regroup is None:
+            return self.sources[name].table
+        if (name, patterns) not in self._regrouped:
+            self._regrouped[name, patterns] = regroup(patterns)
+        return self._regrouped[name, patterns]
 
 
 # All numbers as CSV

@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from docs.results.make_pages import KeptTable, make_pages, make_tables
+from docs.results.make_pages import KeptTable, make_pages, make_tables, shorten_remark
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
 from memmlp.report.tables.build_table import group_clips, make_table
 from memmlp.report.tables.statistics import Verdict, estimate_error
+from memmlp.report.tables.table_text import format_counts
 from memmlp.sweep.definition import Sweep
 
 ROOT = Path(__file__).parent.parent.parent
@@ -85,6 +86,29 @@ def test_what_holds_of_the_paper_is_counted(sweep: Sweep, kept: KeptResults):
     assert counts[1].get("holds", 0) == sum(effect.verdict == Verdict.HOLDS for effect in effects)
 
 
+def test_effects_are_listed_and_counted_with_joined_clips_too(sweep: Sweep, kept: KeptResults):
+    """The coarser table has other verdicts; `above_margin` leaves out the paper's small effects."""
+    made = source(sweep, kept)
+    coarser = make_table(sweep, group_clips(kept.select_runs(sweep), ["(.)"])[0])
+    made = made._replace(regroup=lambda patterns: coarser if patterns == ("(.)",) else made.table)
+    text = fill('{{ claims(["t"], "(.)") }}\n\n{{ decisions(["t"], "holds", joined="(.)") }}|', made)
+    counts = format_counts(coarser.count_verdicts("stream"))
+    assert f"| all, contents joined | {counts} |" in text
+    assert format_counts(made.table.count_verdicts("stream")) != counts
+    assert text.splitlines()[-1] == "|"  # one group decides nothing
+    small = {metric: 1e9 for metric in made.table.metrics}
+    wide = made._replace(table=replace(made.table, smallest=small))
+    assert fill('{{ decisions(["t"], "holds", above_margin=true) }}|', wide).splitlines()[-1] == "|"
+    assert "Table 14 '2'" in fill('{{ decisions(["t"], "holds", above_margin=true) }}', made)
+
+
+def test_long_remarks_lose_their_list_of_variants():
+    text = "timed on a busy machine: 'a'"
+    assert shorten_remark(text) == text
+    assert shorten_remark(text + ", 'b'" * 40) == "timed on a busy machine ([variants](tables/remarks.json))"
+    assert shorten_remark("a: b" * 90) == "a: b" * 90
+
+
 def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResults):
     made = source(sweep, kept)
     errors = [row.cells["stream"]["MPJPE"].mean for row in made.table.rows]
@@ -125,7 +149,7 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
 
     made = made._replace(regroup=coarser)
     line = fill('{{ overview("a", "b") }}', made).splitlines()[-1]
-    cells = [cell for row in made.table.rows for own in row.cells.values() for cell in own.values()]
+    cells = [cell for row in made.table.rows for cell in row.cells[made.table.modes[0]].values()]
     effects = [cell.effect for cell in cells if cell.effect and cell.effect.verdict]
     significant = sum(effect.holm < 0.05 for effect in effects)
     assert 0 < significant < len(effects)

@@ -91,7 +91,7 @@ def find_flags(
         yield from _flag_short_training(every)
     yield from _flag_unequal_training(sweep, runs)
     yield from _flag_missed_budgets(every)
-    yield from _flag_data_warnings(every, "partial", ", and no more")
+    yield from _flag_data_warnings(every, "partial", "trained on a part of the data: ")
     yield from _flag_data_warnings(every, "divided")
     yield from _flag_data_warnings(every, "imported")
     yield from _flag_unequal_versions(every)
@@ -396,10 +396,10 @@ def _flag_busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator
         yield f"times are of the seeds that were timed with a core to themselves: {join_first(fewer)}"
 
 
-def _flag_data_warnings(labelled_runs: LabelledRuns, field: str, ending: str = "") -> Iterator[str]:
+def _flag_data_warnings(labelled_runs: LabelledRuns, field: str, begin: str = "") -> Iterator[str]:
     for warning in drop_repeats(text for _, run in labelled_runs if (text := getattr(run.origin, field))):
         labels = join_quoted(label for label, run in labelled_runs if getattr(run.origin, field) == warning)
-        yield f"{warning}{ending}: {labels}"
+        yield f"{begin}{warning}: {labels}"
 
 
 def _flag_unequal_versions(labelled_runs: LabelledRuns) -> Iterator[str]:

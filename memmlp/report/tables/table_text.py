@@ -112,7 +112,7 @@ def make_legend(table: Table) -> list[str]:
             )
         lines += _explain_branches(table)
         lines += [f"{mode} mode: {text}" for mode in table.modes if (text := describe_power(table, mode))]
-    if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
+    if explain_marks(table):
         lines.append(_summarize_agreement(table))
     return lines
 
@@ -190,29 +190,34 @@ def describe_power(table: Table, mode: str) -> str:
             blind |= dict.fromkeys(table.list_blind_variants(mode, metric))
         else:
             lost.append(metric)
-    but = f" but {', '.join(map(repr, blind))}" if blind else ""
+    but = f" except {', '.join(map(repr, blind))}" if blind else ""
     texts = []
     if found:
-        texts.append(
-            f"smallest difference that every variant{but} detects with 80 % power: {', '.join(found)}"
-        )
+        texts.append(f"with 80 % power every comparison{but} detects a difference of {', '.join(found)}")
     if lost:
         texts.append(
-            f"at least one variant cannot detect even a difference as large as its error in {', '.join(lost)}"
+            f"in {', '.join(lost)} at least one comparison would miss even a difference as large as the error"
         )
     return "; ".join(texts)
 
 
 def _summarize_agreement(table: Table) -> str:
-    mode, costs = table.modes[0], set(table.metrics) & set(COSTS)
+    mode = table.modes[0]
     found, apart = table.count_verdicts(mode), table.count_verdicts(mode, confounded=True)
     summary = f"; of {found.total()} effects in {mode} mode: {format_counts(found)}" if found else ""
     summary += f"; {apart.total()} confounded, counted apart: {format_counts(apart)}" if apart else ""
-    signs = "; of a cost by its sign" if costs else ""
+    return f"paper: value (difference; {explain_marks(table)}){summary}"
+
+
+def explain_marks(table: Table) -> str:
+    """Explain ✓ and ✗ beside the paper's differences; empty if the table has none."""
     cells = [cell for row in table.rows for cells in row.cells.values() for cell in cells.values()]
+    if all(cell.agrees is None for cell in cells):
+        return ""
+    signs = "; of a cost by its sign" if set(table.metrics) & set(COSTS) else ""
     if any(cell.paper_effect and cell.effect and cell.effect.within_noise for cell in cells):
         signs += f", of a time from x {MAX_TIME_RATIO:g} on"
-    return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){summary}"
+    return f"✓ it holds here, ✗ the opposite does{signs}"
 
 
 def format_counts(counts: Counter[Verdict]) -> str:

@@ -366,11 +366,12 @@ def test_the_built_in_body_beside_smplh_numbers(
 
 
 @pytest.mark.parametrize(
-    ("fact", "ending"), [("divided", ""), ("resampled", ""), ("unusual", ""), ("partial", ", and no more")]
+    ("fact", "begin"),
+    [("divided", ""), ("resampled", ""), ("unusual", ""), ("partial", "trained on a part of the data: ")],
 )
 def test_warnings_about_the_data(
-    flags: Callable[..., list[str]], sweep: Sweep, tmp_path: Path, fact: str, ending: str
+    flags: Callable[..., list[str]], sweep: Sweep, tmp_path: Path, fact: str, begin: str
 ):
     origin = {"origin": {fact: "a warning"}}
     found = flags("a warning", lambda label, _: origin if label != LABELS[0] else {})
-    assert found == [f"a warning{ending}: 'by position', 'full_model'"]
+    assert found == [f"{begin}a warning: 'by position', 'full_model'"]
