@@ -10,8 +10,6 @@ from typing import Any, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.files import to_number
 from memmlp.common.overrides import flatten
-from memmlp.runs.deployment_folder import replace_with_deployed_times
-from memmlp.runs.evaluation_file import add_solver_names
 from memmlp.runs.identity import SLOTS, find_option, select_training_config
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.run import STATUSES, Run
@@ -41,8 +39,7 @@ def build_record(run: Run) -> dict[str, Any]:
     """
     run.check_records()
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    named = add_solver_names(run.results, run.configured_evaluations.combined_solvers)
-    results = {key: to_number(value) for key, value in flatten(replace_with_deployed_times(named)).items()}
+    results = {key: to_number(value) for key, value in run.flat_results.items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: find_option(config, slot) for slot in SLOTS if slot in config}

@@ -18,9 +18,10 @@ import yaml
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, sync_folder, write_json
 from memmlp.common.lease import Lease, Lock, check_owner
+from memmlp.common.overrides import flatten
 from memmlp.common.text_formats import join_command
 from memmlp.runs import deployment_folder, records
-from memmlp.runs.deployment_folder import DeploymentFolder
+from memmlp.runs.deployment_folder import DeploymentFolder, replace_with_deployed_times
 from memmlp.runs.environment import (
     create_code_patch,
     describe_environment,
@@ -29,7 +30,7 @@ from memmlp.runs.environment import (
     list_changed_files,
     merge_run_origins,
 )
-from memmlp.runs.evaluation_file import ConfiguredEvaluations, is_intact
+from memmlp.runs.evaluation_file import ConfiguredEvaluations, add_solver_names, is_intact
 from memmlp.runs.identity import (
     belongs_to_folder,
     describe_export_difference,
@@ -335,6 +336,13 @@ class Run:
         config = self.config
         deployed = self.find_shown_deployment(config)
         return results | ({name_latency(deployed, config): deployed.record} if deployed.record else {})
+
+    @property
+    def flat_results(self) -> dict[str, Any]:
+        """The results by dotted key, which names the inverse kinematics. Times and size are those of the file
+        that the config requests. Raises InputError if an evaluation file is damaged."""
+        named = add_solver_names(self.results, self.configured_evaluations.combined_solvers)
+        return flatten(replace_with_deployed_times(named))
 
     @property
     def configured_evaluations(self) -> ConfiguredEvaluations:

@@ -196,14 +196,9 @@ def format_value(record: Record, key: str, whole: bool = False) -> str:
 
 def collect_measured_numbers(run: Run) -> dict[str, Any]:
     """Return the numbers in a run's results by dotted key; the keys include the inverse kinematics' name."""
-    from memmlp.common.overrides import flatten
-    from memmlp.runs.deployment_folder import replace_with_deployed_times
-    from memmlp.runs.evaluation_file import add_solver_names
-
-    results = add_solver_names(run.results, run.configured_evaluations.combined_solvers)
     return {
         key: value
-        for key, value in flatten(replace_with_deployed_times(results)).items()
+        for key, value in run.flat_results.items()
         if isinstance(value, int | float) and not re.match(r"latency[^.]*\.(settings|made)", key)
     }
 

@@ -18,8 +18,6 @@ from typing import Any, NamedTuple, Protocol
 from memmlp.common.files import digest, file_digest, make_json_safe
 from memmlp.common.overrides import flatten
 from memmlp.runs import records
-from memmlp.runs.deployment_folder import replace_with_deployed_times
-from memmlp.runs.evaluation_file import add_solver_names
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.metrics_log import MetricsLog, parse_record
 from memmlp.runs.run import Run
@@ -77,8 +75,6 @@ def read_run_facts(run: Run, running: bool = False) -> RunFacts:
     started = _parse_time(manifest.get("started"))
     ended = _parse_time(failure.get("when") or finished) or max((one.time for one in log), default=started)
     evaluations, deployed = run.configured_evaluations, run.find_shown_deployment(config)
-    named = add_solver_names(replace_with_deployed_times(run.results), evaluations.combined_solvers)
-    results = flatten(named)
     step = max((record.step for record in log), default=0)
     git = manifest.get("git") or {}
     origin = {name: manifest.get(name) for name in ORIGIN}
@@ -102,7 +98,7 @@ def read_run_facts(run: Run, running: bool = False) -> RunFacts:
         data=(str((config.get("data") or {}).get("name") or "data"), str(manifest.get("data"))),
         results=tuple(
             CurvePoint(key.replace(".", "/"), float(value), step, ended)
-            for key, value in results.items()
+            for key, value in run.flat_results.items()
             if _is_number(value)
         ),
         outdated="; ".join(f"{mode} ({changes})" for mode, changes in evaluations.outdated.items()),
