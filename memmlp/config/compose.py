@@ -27,6 +27,7 @@ from memmlp.common.components import SLOTS, collect_attribute, collect_component
 from memmlp.common.errors import InputError
 from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import Override, flatten, parse_overrides, select_last_by_key
+from memmlp.common.schema import parse_config_yaml
 from memmlp.common.settings import Settings
 from memmlp.common.text_formats import join_command, keep_text, make_override
 from memmlp.config import plugins
@@ -179,8 +180,7 @@ def _compose_job(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
     options = [
         override
         for override in parsed
-        if not isinstance(override.value(), dict)
-        and (is_group(group := override.key_or_group) or (find_packaged_folder("conf") / group).is_dir())
+        if not isinstance(override.value(), dict) and _is_any_group(override.key_or_group)
     ]
     values = [override for override in parsed if override not in options]
     special = args.config_name or args.config_path or args.config_dir or any(plugins.list_config_folders())
@@ -356,6 +356,31 @@ def _check_hidden(args: argparse.Namespace) -> None:
                 if hidden.is_file() and hidden.read_bytes() != path.read_bytes():
                     raise InputError(f"{hidden}: Hydra would use {path} instead; rename the file")
         before.append(folder)
+        for path in sorted(folder.rglob("*.yaml")):
+            group = path.relative_to(folder).parent.as_posix()
+            if path.stem == args.config_name if group == "." else _is_any_group(group):
+                _check_scalars(path)
+
+
+def _is_any_group(name: str) -> bool:
+    return is_group(name) or (find_packaged_folder("conf") / name).is_dir()
+
+
+def _check_scalars(path: Path) -> None:
+    """Raise InputError for a text that the command line keeps, but that YAML 1.1 reads as another value, such
+    as 010 and 10_01, which Hydra would convert to the texts 8 and 1001 where a key must be text."""
+    with suppress(yaml.YAMLError, UnicodeDecodeError):  # Hydra's error names the file
+        for token in yaml.scan(path.read_text(encoding="utf-8")):
+            if not isinstance(token, yaml.ScalarToken) or not token.plain:
+                continue
+            if not re.fullmatch(r"[-+.:\w]+", text := token.value) or parse_config_yaml(text) != text:
+                continue
+            value = OmegaConf.create(f"[{text}]")[0]
+            if value != text:
+                line = token.start_mark.line + 1
+                raise InputError(
+                    f"{path}, line {line}: YAML reads {text} as {value}; write '{text}' or {value}"
+                )
 
 
 def _list_search_path(overrides: Sequence[str]) -> list[Path]:

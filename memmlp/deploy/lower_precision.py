@@ -25,15 +25,16 @@ from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import GraphConstants
 from memmlp.deploy.parity import stream_onnx
+from memmlp.evaluation.metric_facts import MIN_FRAMES
 from memmlp.evaluation.metrics import measure_positions
-from memmlp.evaluation.modes import extract_positions, measure_rotation_branch
+from memmlp.evaluation.modes import average_clips, extract_positions, measure_rotation_branch
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import StreamingGraph
 from memmlp.runs.deployment_folder import is_accurate_enough
 
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
-TEST_FRAMES = 20_000  # maximum number of frames for measuring accuracy
+TEST_FRAMES = 20_000  # number of frames for measuring accuracy
 LARGEST = float(np.finfo(np.float16).max)
 
 
@@ -190,18 +191,21 @@ def _make_cast_node(name: str, output: str, kind: int) -> NodeProto:
 def measure_accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
     """Stream clips (N, 252) in ONNX Runtime, and return the mean metrics of the rotation branch.
 
-    "position MPJPE" is the MPJPE of the file's output `position`. At most 20,000 frames are streamed. If the
-    clips have more frames, the same fraction of each clip is streamed, from its start.
+    "position MPJPE" is the MPJPE of the file's output `position`. If the clips have more than 20,000 frames,
+    the same fraction of each clip is streamed, from its start, but enough for every metric. Clips that are
+    too short for a metric do not count (`average_clips`).
     """
     stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
-    rows = []
+    rows, frames = [], []
     for clip in progress_bar(clips, "measuring"):
-        truth = clip[: max(int(share * len(clip)), 2)]
+        truth = clip[: max(int(share * len(clip)), max(MIN_FRAMES.values()))]
         motion = stream_onnx(stream, truth)
         positions = extract_positions(motion), extract_positions(truth[:, SPARSE_DIM:])
         position = measure_positions(*positions)["MPJPE"]
-        rows.append(measure_rotation_branch(normalizer, motion, truth) | {"position MPJPE": position})
-    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+        errors = measure_rotation_branch(normalizer, motion, truth) | {"position MPJPE": position}
+        rows.append({"rotation": errors})
+        frames.append(len(truth))
+    return average_clips(rows, frames)["rotation"]
 
 
 def compare_accuracy(

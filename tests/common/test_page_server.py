@@ -21,6 +21,7 @@ from memmlp.common.page_server import (
     PageHandler,
     PageServer,
     check_token,
+    find_own_address,
     is_loopback,
 )
 
@@ -142,6 +143,8 @@ def test_a_link_from_another_site_keeps_its_token():
         link = "Sec-Fetch-Mode: navigate\r\nSec-Fetch-Site: cross-site"
         with connect(server, f"GET /?token={quote(TOKEN)} HTTP/1.1\r\n{link}\r\n\r\n".encode()) as client:
             answer = client.recv(1000)
+        address = f"http://{find_own_address()}:{server.server_port}/?token="
+        assert server.url.startswith(address), "others cannot open it"
     assert answer.startswith(b"HTTP/1.1 200")
     assert b"Refresh: 0; url=/" in answer
     assert b"SameSite=Strict" in answer

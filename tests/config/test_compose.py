@@ -167,12 +167,16 @@ def test_an_option_of_ones_own_that_ours_hides_is_refused(memmlp, tmp_path: Path
 
 @pytest.mark.parametrize(("file", "text", "choice", "words"), [
     ("memory/gru.yaml", "name: gru", [], ("mine/memory/gru.yaml", "rename the file")),
+    *((
+        "experiment/own.yaml", f"# @package _global_\ndata: {{split: {{groups: [a, '010', {text}]}}}}",
+        ["experiment=own"], ("own.yaml, line 2", f"reads {text} as {value}; write '{text}'"),
+    ) for text, value in {"010": 8, "10_01": 1001, "12:30": 750, "off": False}.items()),
     (
         "experiment/own.yaml", "# @package _global_\ndefaults: [{/experiment: no_codes}]",
         ["experiment=own"], ("experiment=own", "includes itself", "'- NAME'"),
     ),
 ])  # fmt: skip
-def test_a_file_that_hides_a_component_or_leads_back_to_itself_is_refused(
+def test_a_config_file_that_hydra_would_misread_is_refused(
     memmlp: Memmlp, tmp_path: Path, file: str, text: str, choice: list[str], words: tuple[str, ...]
 ):
     (tmp_path / "mine" / file).parent.mkdir(parents=True)

@@ -108,6 +108,13 @@ def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     return exact, half
 
 
+def test_a_small_share_of_each_clip_has_a_jitter(step_files, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(lower_precision, "TEST_FRAMES", 6)  # two frames of each
+    normalizer = exported.NETWORKS["mem_mlp"]().normalizer
+    found = lower_precision.measure_accuracy(step_files("mem_mlp"), normalizer, [*CLIPS, tiny.clip(3)])
+    assert np.isfinite(list(found.values())).all()
+
+
 def test_accuracy_is_that_of_the_evaluation(pair):
     model = exported.NETWORKS["mem_mlp"]()
     found = lower_precision.measure_accuracy(pair[0], model.normalizer, CLIPS)

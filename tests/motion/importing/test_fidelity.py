@@ -101,6 +101,17 @@ def test_swapped_sides_without_toes_and_a_small_unit_are_said(tmp_path: Path) ->
     assert said == ("the legs are 0.34 m long, so the unit may be wrong",)
 
 
+def test_hips_that_turn_below_the_pelvis_are_said(tmp_path: Path) -> None:
+    """As where another program turns the joint above the hip, which its own files never turn."""
+    name, file = "cmu_motionbuilder", tree("cmu_motionbuilder")
+    written = performed(load_skeleton(name), synthesize_clip("walking", 1, seconds=1.0), sample=file)
+    column = 3 + 3 * file.names.index("LHipJoint")
+    for degrees in (0.0, 20.0):
+        written.values[:, column : column + 3] = [degrees, 0, 0]
+        told = "; ".join(converted(write(tmp_path, written.text()), load_skeleton(name)).fidelity.faults)
+        assert ("left_hip moves relative to the pelvis by" in told) == bool(degrees)
+
+
 def test_palms_that_face_elsewhere_are_said(tmp_path: Path) -> None:
     """A T-pose whose arms are turned about themselves, which only the axes of the elbows show."""
     sample = own_tree(DAZ)

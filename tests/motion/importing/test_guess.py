@@ -72,6 +72,13 @@ def test_a_proposed_map_imports(tmp_path: Path):
     assert done.fidelity.faults == ()
 
 
+def test_a_prefix_that_the_root_lacks_does_not_hide_the_head(tmp_path: Path):
+    bvh = walks(tmp_path, "iclone")
+    root, *others = joints(bvh)
+    bvh = renamed(bvh, {root: "RL_BoneRoot"} | {joint: f"CC_Base_{joint}" for joint in others})
+    assert guess_map(bvh, "mine").skeleton.joints["head"] == "CC_Base_Head"
+
+
 def test_a_joint_without_a_known_name_is_left_to_the_user(tmp_path: Path):
     bvh = walks(tmp_path, "lafan1")
     names = {joint: joint for joint in joints(bvh)} | {"LeftForeArm": "bone7"}
