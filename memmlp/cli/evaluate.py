@@ -84,6 +84,7 @@ def evaluate(
 @click.argument("overrides", nargs=-1)
 @click.option("--mean", type=PATH, help="File with the mean of the rotations, if the network needs it.")
 @click.option("--std", type=PATH, help="File with the standard deviation of the rotations; with --mean.")
+@click.option("--refiner", type=PATH, help="File with the weights of SAGE-Net's refiner.")
 @plugins_option
 @outputs_option
 def import_weights(
@@ -92,6 +93,7 @@ def import_weights(
     overrides: tuple[str, ...],
     mean: Path | None,
     std: Path | None,
+    refiner: Path | None,
     outputs: Path,
 ) -> None:
     """Make a finished run from weights that a network's authors publish.
@@ -105,4 +107,4 @@ def import_weights(
     from memmlp.config.open_run import import_weights as run_import
 
     words = [*overrides, make_override("paths.outputs", str(outputs.absolute()))]
-    show(run_import(model, checkpoint, words, [mean, std] if mean and std else []))
+    show(run_import(model, checkpoint, words, [mean, std] if mean and std else [], refiner))

@@ -1,14 +1,14 @@
 """Opens finished runs with their experiments and data, and makes runs from published weights."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from memmlp.common.components import find_component, list_component_names
 from memmlp.common.errors import InputError
@@ -23,6 +23,7 @@ from memmlp.motion.motion_source import PreparedMotion, ShippedMotion
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.refiner import RefinedModel, SAGERefinerSettings
 from memmlp.networks.settings import Release
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, select_training_config
 from memmlp.runs.lookup import find_run, find_shipped_clip, get_shipped_name
@@ -105,7 +106,11 @@ def load_network(run: Run, experiment: Experiment) -> MotionModel:
 
 
 def import_weights(
-    name: str, path: Path, overrides: Sequence[str], statistics: Sequence[Path] = ()
+    name: str,
+    path: Path,
+    overrides: Sequence[str],
+    statistics: Sequence[Path] = (),
+    refiner: Path | None = None,
 ) -> Outcome:
     """Make a finished run from a checkpoint that a network's authors publish, and evaluate and deploy it.
 
@@ -117,6 +122,7 @@ def import_weights(
         overrides: overrides KEY=VALUE, such as the data.
         statistics: the files with mean and standard deviation of the rotations, for a network with z-scores;
             by default, those of the training clips are used.
+        refiner: the checkpoint of SAGE-Net's refiner, to put behind the network.
 
     Raises:
         InputError: if the checkpoint cannot be read, or does not fit the network and the overrides.
@@ -126,13 +132,14 @@ def import_weights(
         known = [one for one in list_component_names("model") if _get_release(one)]
         raise InputError(f"{name}: has no published weights; must be {' or '.join(known)}")
     kind: type[MotionModel] = network.kind
-    tensors = kind.adapt_published(checkpoint.read_published(path))
+    files = [path, *([refiner] if refiner else [])]
     vectors = checkpoint.read_published_statistics(statistics, ROTATION.stop) if statistics else None
-    digest = hashlib.sha256("".join(map(file_digest, (path, *statistics))).encode()).hexdigest()
-    with _naming_checkpoint(path):
-        sizes = checkpoint.find_published_sizes(tensors, release)
-    values = {"profile": "paper", **release.config, **sizes}
-    words = [f"model={name}", *(f"{key}={format_value(value)}" for key, value in values.items())]
+    digest = hashlib.sha256("".join(map(file_digest, (*files, *statistics))).encode()).hexdigest()
+    tensors, sizes = _read_published(path, release)
+    refining, more = _read_published(refiner, SAGERefinerSettings.release) if refiner else ({}, {})
+    values = {"profile": "paper", **release.config, **sizes, **more}
+    words = [f"model={name}", *(["refiner=sage"] if refiner else [])]
+    words += [f"{key}={format_value(value)}" for key, value in values.items()]
     cfg = compose_config([*words, *overrides, make_override("imported_weights", digest[:16])])
     if statistics and not cfg.normalizer.z_scores:
         raise InputError(f"--mean: must be left out with model={name}, which does not normalise the motion")
@@ -141,13 +148,32 @@ def import_weights(
     model = architecture.build(
         Normalizer.from_coordinates(architecture.coordinates, torch.zeros(22, 3)), None
     )
-    with _naming_checkpoint(path):
-        renamed = checkpoint.rename_published(tensors, release, dict(model.named_parameters()))
-    origin = {"model": name, "file": path.name, "sha256": file_digest(path), "source": release.source}
+    own = model.network if isinstance(model, RefinedModel) and refiner else model
+    renamed = _rename_published(path, kind.adapt_published(tensors), release, own)
+    if refiner and isinstance(model, RefinedModel):
+        parts = nn.ModuleDict({"layers": model.layers, "head": model.head})
+        renamed = {f"network.{key}": tensor for key, tensor in renamed.items()}
+        renamed |= _rename_published(refiner, refining, SAGERefinerSettings.release, parts)
+    origin = {"model": name, "source": release.source}
+    origin |= {"file": " + ".join(one.name for one in files), "sha256": " + ".join(map(file_digest, files))}
     training = experiment.training
     assert isinstance(training, WeightsImport)
     training = replace(training, published=PublishedWeights(renamed, vectors, origin))
     return run_experiment(replace(experiment, training=training))
+
+
+def _read_published(path: Path, release: Release) -> tuple[dict[str, Tensor], dict[str, int]]:
+    """Return a checkpoint's tensors, and the config values that their shapes determine."""
+    tensors = checkpoint.read_published(path)
+    with _naming_checkpoint(path):
+        return tensors, checkpoint.find_published_sizes(tensors, release)
+
+
+def _rename_published(
+    path: Path, tensors: Mapping[str, Tensor], release: Release, module: nn.Module
+) -> dict[str, Tensor]:
+    with _naming_checkpoint(path):
+        return checkpoint.rename_published(tensors, release, dict(module.named_parameters()))
 
 
 def _get_release(name: str) -> Release | None:

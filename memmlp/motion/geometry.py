@@ -37,16 +37,22 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
 def matrix_to_wxyz(matrix: Tensor) -> Tensor:
     """Convert matrices (..., 3, 3) to unit quaternions (..., 4) in the order wxyz, with w >= 0."""
-    m = matrix
+    forms = _make_quaternion_forms(matrix)
+    # Four scaled forms of the same quaternion; the form with the largest pivot is well conditioned.
+    pivot = forms.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    return _choose_quaternion(forms, pivot)
+
+
+def _make_quaternion_forms(m: Tensor) -> Tensor:
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    # Four scaled forms of the same quaternion; the form with the largest pivot is well conditioned.
-    pivots = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz]
-    ww, xx, yy, zz = pivots
+    ww, xx, yy, zz = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
     rows = [ww, wx, wy, wz], [wx, xx, xy, xz], [wy, xy, yy, yz], [wz, xz, yz, zz]
-    forms = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    pivot = torch.stack(pivots, -1).argmax(-1)
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def _choose_quaternion(forms: Tensor, pivot: Tensor) -> Tensor:
     index = pivot[..., None, None].expand(*pivot.shape, 1, 4)
     quaternion = F.normalize(forms.gather(-2, index).squeeze(-2), dim=-1)
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
@@ -83,6 +89,29 @@ def _normalize(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]
     square = torch.addcmul(torch.addcmul(x * x, y, y), z, z)
     size = square.clamp_min(1e-24).sqrt()  # 1e-12 at least, as in F.normalize
     return x / size, y / size, z / size
+
+
+def complete_columns(sixd: Tensor) -> Tensor:
+    """Return 6D (..., 6) and its columns' cross product as matrices (..., 3, 3), which are rotations only if
+    the columns are orthonormal. See `sixd_to_matrix`."""
+    first, second = sixd[..., :3], sixd[..., 3:]
+    return torch.stack([first, second, torch.linalg.cross(first, second, dim=-1)], -1)
+
+
+def convert_almost_rotations(matrix: Tensor) -> Tensor:
+    """Convert matrices (..., 3, 3) that are almost rotations to rotations (..., 3, 3), through the quaternion
+    that human_body_prior reads from them. It chooses the quaternion's form by signs of the diagonal."""
+    xx, yy, zz = matrix.diagonal(dim1=-2, dim2=-1).unbind(-1)
+    # the forms' pivots, in this order: w, x, y, z
+    flat = torch.where(xx > yy, 1, 2)
+    pivot = torch.where(zz < 1e-6, flat, torch.where(xx < -yy, 3, 0))
+    w, x, y, z = _choose_quaternion(_make_quaternion_forms(matrix), pivot).unbind(-1)
+    rows = (
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def compute_geodesic_angle(a: Tensor, b: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from memmlp.networks.motion_model import (
     TrainingOutputs,
     WindowModel,
 )
-from memmlp.networks.settings import NetworkSettings, Release
+from memmlp.networks.settings import NetworkSettings, Release, make_strided_times
 from memmlp.networks.streaming import StemGraph, make_linear
 
 BLOCK_NAMES = {
@@ -219,7 +219,7 @@ class AGRoLDiffusionSettings(AGRoLMLPSettings):
         if model["width"] % 2:
             yield f"model.width={model['width']}: must be even with model=agrol_diffusion"
         steps, calls = model["diffusion_steps"], model["sampling_steps"]
-        if model["sampler"] == "posterior" and len(range(0, steps, -(-steps // calls))) != calls:
+        if model["sampler"] == "posterior" and len(make_strided_times(steps, calls)) != calls:
             yield f"model.sampling_steps={calls}: must divide {steps} steps with model.sampler=posterior"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
@@ -23,10 +24,15 @@ from memmlp.motion.body import (
     SPARSE_VELOCITY,
     TRACKED,
 )
-from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.geometry import (
+    complete_columns,
+    convert_almost_rotations,
+    forward_kinematics,
+    matrix_to_sixd,
+)
 from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
-from memmlp.networks.settings import NetworkSettings
+from memmlp.networks.settings import NetworkSettings, Release, name_encoder
 from memmlp.networks.streaming import StemGraph
 from memmlp.networks.transformer import EncoderLayer, initialize_weights, make_encoder
 
@@ -105,7 +111,7 @@ class AvatarJLMGraph(StemGraph):
         return outputs
 
 
-@component("model", "avatar_jlm", version=2, builds="AvatarJLM")
+@component("model", "avatar_jlm", version=3, builds="AvatarJLM")
 @dataclass
 class AvatarJLMSettings(NetworkSettings):
     """AvatarJLM (Zheng et al. 2023): attention over the joints of a coarse pose, and over time.
@@ -128,6 +134,26 @@ class AvatarJLMSettings(NetworkSettings):
 
     defaults: ClassVar = {"loss": "avatar_jlm"}
     recipe: ClassVar = tuned(8.0e-3)
+    release: ClassVar = Release(
+        source="zxz267/AvatarJLM 9d27b35",
+        names={
+            "embedding.*": "linear_embedding_static.*",
+            "coarse.*.*": "joint_regressor.regressor.*.*",
+            "position_token.*": "position_embedding.*",
+            "rotation_token.*": "rotation_embedding.*",
+            "input_token.*": "input_token_embedding.*",
+            "joint_places": "motion_net.joint_position_embed",
+            "time_places": "motion_net.temp_embed",
+            **name_encoder("layers.*", "motion_net.transformer.layers.*"),
+            "regressor.*.*": "motion_net.param_regressor.*.*",
+        },
+        sizes={
+            "model.width": ("position_embedding.weight", 0),
+            "model.depth": "motion_net.transformer.STB.*.layers.0.linear1.weight",
+            "model.feedforward": ("motion_net.transformer.STB.0.layers.0.linear1.weight", 0),
+        },
+        unused=("body_model.**", "joint_regressor.body_model.**", "motion_net.body_model.**"),
+    )
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
@@ -174,6 +200,26 @@ class AvatarJLM(WindowModel):
         )
         initialize_weights(self)
 
+    @classmethod
+    def adapt_published(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Number the layers in order: the released code has a list for joints and a list for frames."""
+
+        def rename(name: str) -> str:
+            found = re.fullmatch(r"(motion_net\.transformer\.)([ST])TB\.(\d+)\.layers\.0(\..*)", name)
+            return f"{found[1]}layers.{2 * int(found[3]) + (found[2] == 'T')}{found[4]}" if found else name
+
+        return {rename(name): tensor for name, tensor in tensors.items()}
+
+    @staticmethod
+    def read_coarse_pose(sixd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the coarse pose's local matrices (..., 22, 3, 3) for rotation tokens, and its rotations.
+
+        Like the released code, it does not make the columns orthonormal for the tokens. Positions follow from
+        the rotations that human_body_prior reads from them.
+        """
+        columns = complete_columns(sixd)
+        return columns, convert_almost_rotations(columns)
+
     def place_coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coarse pose for embeddings (..., 2 d), in the network's coordinates without z-scores.
 
@@ -183,10 +229,12 @@ class AvatarJLM(WindowModel):
         mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
         sixd = (self.coarse(embedded) * std + mean).unflatten(-1, (N_JOINTS, 6))
         with use_float32(sixd.device):
-            local = sixd_to_matrix(sixd)
-            pelvis = torch.zeros_like(local[..., 0, :, 0])
-            rotations, positions = forward_kinematics(local, pelvis, self.normalizer.rest)
-        return positions - positions[..., HEAD : HEAD + 1, :], matrix_to_sixd(rotations)
+            matrices, rotations = self.read_coarse_pose(sixd)
+            pelvis = torch.zeros_like(rotations[..., 0, :, 0])
+            turned, positions = forward_kinematics(rotations, pelvis, self.normalizer.rest)
+            if matrices is not rotations:
+                turned, _ = forward_kinematics(matrices, pelvis, self.normalizer.rest)
+        return positions - positions[..., HEAD : HEAD + 1, :], matrix_to_sixd(turned)
 
     def make_tokens(self, encoded: Tensor) -> Tensor:
         """Map inputs (..., 54) in network space to tokens (..., 45, d), without position embeddings."""

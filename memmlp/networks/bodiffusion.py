@@ -20,7 +20,7 @@ from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import AncestralDiffusion, DenoiserOutput, TimeEmbedding
 from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
-from memmlp.networks.settings import NetworkSettings, Release
+from memmlp.networks.settings import NetworkSettings, Release, name_dit_blocks
 from memmlp.networks.streaming import StemGraph, make_linear
 from memmlp.networks.transformer import DiTBlock
 
@@ -127,13 +127,7 @@ class BoDiffusionSettings(NetworkSettings):
             "spread.*": "cond_emb.projections.*",
             "stem.*": "input_process.poseEmbedding.*",
             "places": "pos_embed",
-            "blocks.*.attention.query.*": "blocks.*.attn.qkv.*[0/3]",
-            "blocks.*.attention.key.*": "blocks.*.attn.qkv.*[1/3]",
-            "blocks.*.attention.value.*": "blocks.*.attn.qkv.*[2/3]",
-            "blocks.*.attention.out.*": "blocks.*.attn.proj.*",
-            "blocks.*.mlp.0.*": "blocks.*.mlp.fc1.*",
-            "blocks.*.mlp.2.*": "blocks.*.mlp.fc2.*",
-            "blocks.*.modulation.*": "blocks.*.adaLN_modulation.1.*",
+            **name_dit_blocks("blocks.*", "blocks.*"),
             "head.*": "out.poseFinal.*",
             "joint_head.*": "out.featsFinal.*",
         },

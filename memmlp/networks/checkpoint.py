@@ -83,6 +83,14 @@ def read_published(path: Path) -> dict[str, Tensor]:
     for key in CONTAINERS:
         if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
             content = content[key]
+    if isinstance(content, Mapping):  # SAGE-Net's parts are beside each other
+        parts = {
+            key: part
+            for key, part in content.items()
+            if str(key).endswith("_state_dict") and isinstance(part, Mapping)
+        }
+        if parts:
+            content = {f"{key}.{name}": one for key, part in parts.items() for name, one in part.items()}
     if not isinstance(content, Mapping) or not all(isinstance(key, str) for key in content) or not content:
         raise InputError(f"{path}: must contain tensors by name")
     prefix = "module." if all(key.startswith("module.") for key in content) else ""

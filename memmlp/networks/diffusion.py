@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.networks.settings import make_strided_times
 
 Denoise = Callable[[Tensor, Tensor], Tensor]
 
@@ -85,6 +86,11 @@ class Diffusion(NoiseProcess):
         super().__init__(make_cosine_schedule(steps), sampling_steps)
 
     @property
+    def calls(self) -> int:
+        """The number of denoiser calls for a sample."""
+        return len(self.times)
+
+    @property
     def noise_draws(self) -> int:
         """The number of noise draws for a sample: one, for its start."""
         return 1
@@ -98,11 +104,11 @@ class Diffusion(NoiseProcess):
             further: the noise of further draws (`noise_draws`), which broadcasts to the signal.
         """
         x = noise
-        for index, time in enumerate(self.times):
+        for index, time in enumerate(self.times[: self.calls]):
             clean = denoise(x, torch.full((len(x),), time, device=x.device))
-            if index + 1 < len(self.times):
-                x = self.step(x, clean, index, further[index] if further else None)
-        return clean
+            is_last = index + 1 == len(self.times)
+            x = clean if is_last else self.step(x, clean, index, further[index] if further else None)
+        return x
 
     def step(self, x: Tensor, clean: Tensor, index: int, noise: Tensor | None = None) -> Tensor:
         """Take one sampling step.
@@ -121,6 +127,23 @@ class Diffusion(NoiseProcess):
         return there.sqrt() * clean + (1 - there).sqrt() * direction
 
 
+class StridedDiffusion(Diffusion):
+    """Diffusion with a cosine schedule and DDIM sampling as in SAGE-Net's released code.
+
+    The sampling times are multiples of a stride and start below pure noise. A sample ends with the noisy
+    signal at time 0. The released code calls the denoiser once more, without an effect on its sample.
+    """
+
+    def __init__(self, steps: int, sampling_steps: int):
+        super().__init__(steps, sampling_steps)
+        self.times = make_strided_times(steps, sampling_steps)
+
+    @property
+    def calls(self) -> int:
+        """The number of denoiser calls for a sample."""
+        return len(self.times) - 1
+
+
 class PosteriorDiffusion(Diffusion):
     """Diffusion with a cosine schedule, sampled as in AGRoL's released code.
 
@@ -132,7 +155,7 @@ class PosteriorDiffusion(Diffusion):
 
     def __init__(self, steps: int, sampling_steps: int):
         super().__init__(steps, sampling_steps)
-        self.times = list(range(0, steps, math.ceil(steps / sampling_steps)))[::-1]
+        self.times = make_strided_times(steps, sampling_steps)
         posterior = compute_posterior(make_cosine_schedule(steps)[self.times[::-1]]).flip(-1)
         self.register_buffer("posterior", posterior.float(), persistent=False)
 

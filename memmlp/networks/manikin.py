@@ -248,6 +248,7 @@ class ManikinSSettings(AvatarPoserSettings):
     turned: bool = setting(default=True)  # true: rotate training windows to random headings
 
     defaults: ClassVar = {"loss": "manikin_s"}
+    release: ClassVar = None  # type: ignore[assignment]
     recipe: ClassVar = tuned(2.0e-3)
 
 
@@ -328,6 +329,7 @@ class ManikinLSettings(AvatarJLMSettings):
     offline: bool = setting(default=False)
 
     defaults: ClassVar = {"loss": "manikin_l"}
+    release: ClassVar = None  # type: ignore[assignment]
     recipe: ClassVar = {"optim.lr": "${profile.lr}", "optim.warmup": 0}  # not searched
 
 
@@ -346,6 +348,12 @@ class ManikinL(Manikin, AvatarJLM):
         super().__init__(normalizer, settings)
         self.parts_weight, self.turned = settings.parts_weight, settings.turned
         self.is_stream = not settings.offline
+
+    @staticmethod
+    def read_coarse_pose(sixd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the coarse pose's local rotations (..., 22, 3, 3) twice; see AvatarJLM."""
+        rotations = sixd_to_matrix(sixd)
+        return rotations, rotations
 
     def predict_parts(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) in network space to outputs (B, T, 212) for all their frames."""

@@ -7,7 +7,7 @@ network. It is trained on the poses that the trained network streams (memmlp.tra
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,7 @@ from memmlp.common.settings import Settings, at_least, one_of, positive, setting
 from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.motion_model import MotionModel, State, StreamingGraph
+from memmlp.networks.settings import Release
 from memmlp.networks.streaming import FrameGRU, has_streaming_graph, make_streaming_graph
 
 HIDDEN = "refiner"  # the name of the refiner's own state
@@ -40,6 +41,15 @@ class SAGERefinerSettings(Settings):
     pieces: int = setting(at_least(1), tiny=8, small=512, paper=2048)
     velocities: str = setting(one_of("rotations", "joints"), "rotations")  # what the velocity loss compares
     lr: float | None = setting(positive(), None)  # initial learning rate; null: optim.lr
+
+    release: ClassVar = Release(
+        source="Wenchao-M/SAGE 07415ac",
+        names={"layers.*": "refine_net.*", "head.*": "linear.*"},
+        sizes={
+            "refiner.width": ("refine_net.weight_hh_l0", 1),
+            "refiner.depth": "refine_net.weight_ih_l*",
+        },
+    )
 
     def build(self, network: MotionModel) -> RefinedModel:
         """Add a refiner with random weights behind a network."""

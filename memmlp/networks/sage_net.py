@@ -12,10 +12,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, fraction, setting, sized
+from memmlp.common.settings import at_least, fraction, one_of, setting, sized
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.diffusion import Diffusion
+from memmlp.networks.diffusion import Diffusion, StridedDiffusion
 from memmlp.networks.motion_model import NewestFrameModel, State, TrainingOutputs
 from memmlp.networks.sage_parts import (
     LATENT,
@@ -25,9 +25,11 @@ from memmlp.networks.sage_parts import (
     UpperDenoiser,
     make_position_embeddings,
 )
-from memmlp.networks.settings import NetworkSettings
+from memmlp.networks.settings import NetworkSettings, Release, make_strided_times, name_dit_blocks
 from memmlp.networks.streaming import StemGraph, make_linear
 from memmlp.networks.transformer import DiTBlock
+
+DECODER = "decoder_state_dict.decoder_stacks.0"  # the released code's name of the decoder's blocks
 
 
 class DenoiserAtSamplingTimes(nn.Module):
@@ -79,7 +81,8 @@ class SAGENetGraph(StemGraph):
     def build(self, model: Any) -> None:
         self.diffusion, self.noises, self.decoder = model.diffusion, model.noises, model.decoder
         self.upper, self.lower = (
-            DenoiserAtSamplingTimes(part, model.diffusion.times) for part in (model.upper, model.lower)
+            DenoiserAtSamplingTimes(part, model.diffusion.times[: model.diffusion.calls])
+            for part in (model.upper, model.lower)
         )
         self.beside = model.lower.beside
         conditions = model.upper.condition, model.lower.condition, model.decoder.condition
@@ -120,11 +123,11 @@ class SAGENetGraph(StemGraph):
     ) -> Tensor:
         """Sample latents (T // 2, 384) from noise, given the denoiser's carried window features (T, d)."""
         condition, noisy = sampler.condition(seen), noise
-        for index in range(len(self.diffusion.times)):
+        for index in range(self.diffusion.calls):
             clean = sampler(merge_latents(noisy), condition, index)
-            if index + 1 < len(self.diffusion.times):
-                noisy = self.diffusion.step(noisy, clean, index)
-        return clean
+            is_last = index + 1 == len(self.diffusion.times)
+            noisy = clean if is_last else self.diffusion.step(noisy, clean, index)
+        return noisy
 
 
 @component("model", "sage", builds="SAGENet")
@@ -153,18 +156,60 @@ class SAGESettings(NetworkSettings):
     sampling_steps: int = setting(at_least(1), 5)  # number of calls of each diffusion model per pose
     noise: float = setting(at_least(0), 0.01)  # standard deviation of the initial noise of sampling
     noise_seed: int = setting(at_least(0), 0)  # seed of the sampling noise, equal for all windows
+    # ddim; strided: like the released code, with one denoiser call less and the noise that is left at time 0
+    sampler: str = setting(one_of("ddim", "strided"), "ddim")
 
     learns_newest_frame: ClassVar[bool] = True
     defaults: ClassVar = {"loss": "sage", "prerequisite": "sage"}
     recipe: ClassVar = {"optim.steps": sized(20, 1000, 56000), "optim.lr": sized(5.0e-4, 5.0e-4, 8.0e-5)}
+    release: ClassVar = Release(
+        source="Wenchao-M/SAGE 07415ac",
+        names={
+            "decoder.condition.time.*": "decoder_state_dict.sparse_up_conv.*",
+            "*.condition.mixture.spread.*": "*_state_dict.cond_encoder.*",
+            "*.condition.linear.*": "*_state_dict.cond_encoder2.*",
+            "*.condition.time.*": "*_state_dict.denoiser_upper.sparse_up_conv.*",
+            "*.time.mlp.*.*": "*_state_dict.denoiser_upper.embed_timestep.mlp.*.*",
+            "upper.align.*": "upper_state_dict.denoiser_upper.align_net.*",
+            "lower.align.*": "lower_state_dict.denoiser_upper.upper_align_net.*",
+            "lower.beside.*": "lower_state_dict.denoiser_upper.down_dim_init.*",
+            "decoder.stem.*": "decoder_state_dict.post_quant_emb.*",
+            "*.stem.*": "*_state_dict.denoiser_upper.down_dim.*",
+            **name_dit_blocks("*.blocks.*", "*_state_dict.denoiser_upper.blocks.*"),
+            "*.head.*": "*_state_dict.denoiser_upper.last.*",
+            "decoder.stack.blocks.*.attention_norm.*": f"{DECODER}.blocks.*.ln1.*",
+            "decoder.stack.blocks.*.attention.out.*": f"{DECODER}.blocks.*.attn.proj.*",
+            "decoder.stack.blocks.*.attention.*.*": f"{DECODER}.blocks.*.attn.*.*",
+            "decoder.stack.blocks.*.norm.*": f"{DECODER}.blocks.*.ln2.*",
+            "decoder.stack.blocks.*.mlp.*.*": f"{DECODER}.blocks.*.mlp.*.*",
+            "decoder.stack.norm.*": f"{DECODER}.ln_f.*",
+            "decoder.stack.head.*": f"{DECODER}.head.*",
+            "decoder.stack.convolution.*": f"{DECODER}.up_conv.conv.*",
+            "decoder.heads.0.*.*": "decoder_state_dict.reg_root.*.*",
+            "decoder.heads.1.*.*": "decoder_state_dict.reg_body.*.*",
+        },
+        sizes={
+            "model.frames": ("decoder_state_dict.sparse_up_conv.weight", 1),
+            "model.width": ("upper_state_dict.cond_encoder2.weight", 0),
+            "model.depth": "upper_state_dict.denoiser_upper.blocks.*.attn.qkv.weight",
+            "model.code_width": ("decoder_state_dict.post_quant_emb.weight", 0),
+            "model.code_depth": f"{DECODER}.blocks.*.ln1.weight",
+        },
+        unused=(f"{DECODER}.pos.0.pe",),
+        config={"model.sampler": "strided"},
+    )
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
         """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
+        model = config["model"]
         for key in ("frames", "code_width"):  # its codes are of two frames each
-            if config["model"][key] % 2:
-                yield f"model.{key}={config['model'][key]}: must be even with model=sage"
+            if model[key] % 2:
+                yield f"model.{key}={model[key]}: must be even with model=sage"
+        calls, steps = model["sampling_steps"], model["diffusion_steps"]
+        if model["sampler"] == "strided" and (calls < 2 or len(make_strided_times(steps, calls)) != calls):
+            yield f"model.sampling_steps={calls}: must divide {steps} and be above 1 with sampler=strided"
 
 
 class SAGENet(NewestFrameModel):
@@ -182,7 +227,8 @@ class SAGENet(NewestFrameModel):
     def __init__(self, normalizer: Normalizer, settings: SAGESettings):
         super().__init__(normalizer, settings.frames)
         self.settings = settings
-        self.diffusion = Diffusion(settings.diffusion_steps, settings.sampling_steps)
+        sampler = {"ddim": Diffusion, "strided": StridedDiffusion}[settings.sampler]
+        self.diffusion = sampler(settings.diffusion_steps, settings.sampling_steps)
         self.upper, self.lower = UpperDenoiser(settings), LowerDenoiser(settings)
         self.decoder = Decoder(settings)
         draw = torch.Generator().manual_seed(settings.noise_seed)

@@ -40,6 +40,21 @@ def name_encoder(ours: str, theirs: str) -> dict[str, str]:
     return names
 
 
+def name_dit_blocks(ours: str, theirs: str) -> dict[str, str]:
+    """Return the names of DiT blocks for a Release: ours, and those of the DiT code with layers of timm."""
+    parts = {"attention.out": "attn.proj", "mlp.0": "mlp.fc1", "mlp.2": "mlp.fc2"}
+    parts |= {"modulation": "adaLN_modulation.1"}
+    names = {f"{ours}.{mine}.*": f"{theirs}.{part}.*" for mine, part in parts.items()}
+    for index, part in enumerate(("query", "key", "value")):
+        names[f"{ours}.attention.{part}.*"] = f"{theirs}.attn.qkv.*[{index}/3]"
+    return names
+
+
+def make_strided_times(steps: int, count: int) -> list[int]:
+    """Return `count` multiples of a stride below `steps`, the largest first; fewer if it does not divide."""
+    return list(range(0, steps, -(-steps // count)))[::-1]
+
+
 @dataclass
 class NetworkSettings(Settings):
     """The settings of a network without slots, which needs memory, predictor, hand and term to be null.

@@ -48,6 +48,17 @@ def test_sixd_is_two_columns_and_gram_schmidt_of_anything(count):
         torch.testing.assert_close(geometry.sixd_to_matrix(columns), matrix)
 
 
+def test_almost_rotations_are_read_as_human_body_prior_does():
+    """Rotations stay. Otherwise the diagonal's signs choose the quaternion's form, not its largest pivot."""
+    rotations = torch.tensor(Rotation.random(200, random_state=0).as_matrix())
+    torch.testing.assert_close(geometry.convert_almost_rotations(rotations), rotations)
+    columns = geometry.complete_columns(geometry.matrix_to_sixd(rotations))
+    torch.testing.assert_close(columns, rotations)
+    stretched = torch.tensor([[1, 0, 0], [0, 0.5, -0.9], [0, 0.9, -0.1]], dtype=torch.float64)
+    expected = Rotation.from_quat([1 + 1 - 0.5 + 0.1, 0, 0, 0.9 + 0.9]).as_matrix()
+    torch.testing.assert_close(geometry.convert_almost_rotations(stretched), torch.tensor(expected))
+
+
 def test_geodesic_angle():
     a = torch.tensor(Rotation.random(50, rng=2).as_matrix())
     for angle in (0.0, 1e-6, math.pi):

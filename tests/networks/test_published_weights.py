@@ -7,6 +7,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import onnx
 import pytest
 import tiny
 import torch
@@ -17,7 +18,14 @@ from torch import Tensor, nn
 from memmlp.common.components import find_component
 from memmlp.config.open_run import open_run
 from memmlp.deploy.export import make_metadata
+from memmlp.deploy.opsets import OPSETS
 from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.geometry import (
+    complete_columns,
+    convert_almost_rotations,
+    forward_kinematics,
+    matrix_to_sixd,
+)
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
@@ -193,11 +201,11 @@ class Rolling(nn.ModuleDict):
 
 
 class ModulatedBlock(nn.ModuleDict):
-    """A block of BoDiffusion."""
+    """A block of BoDiffusion, or of SAGE-Net with a ratio of 4."""
 
-    def __init__(self) -> None:
+    def __init__(self, ratio: int = 1) -> None:
         parts = {"attn": {"qkv": nn.Linear(D, 3 * D), "proj": nn.Linear(D, D)}}
-        parts |= {"mlp": {"fc1": nn.Linear(D, D), "fc2": nn.Linear(D, D)}}
+        parts |= {"mlp": {"fc1": nn.Linear(D, ratio * D), "fc2": nn.Linear(ratio * D, D)}}
         super().__init__({name: nn.ModuleDict(layers) for name, layers in parts.items()})
         self["adaLN_modulation"] = nn.Sequential(nn.SiLU(), nn.Linear(D, 6 * D))
 
@@ -209,6 +217,11 @@ class ModulatedBlock(nn.ModuleDict):
         h = h + changes[2] * self["attn"]["proj"](attended)
         seen = F.layer_norm(h, [D], eps=1e-6) * (1 + changes[4]) + changes[3]
         return h + changes[5] * self["mlp"]["fc2"](F.gelu(self["mlp"]["fc1"](seen), approximate="tanh"))
+
+
+def make_sines(time: int) -> Tensor:
+    angles = time * torch.exp(-torch.log(torch.tensor(1e4)) * torch.arange(128) / 128)
+    return torch.cat([angles.cos(), angles.sin()])[None]
 
 
 class JointDenoiser(nn.ModuleDict):
@@ -225,8 +238,7 @@ class JointDenoiser(nn.ModuleDict):
         self.pos_embed = nn.Parameter(torch.randn(1, T, D))
 
     def forward(self, x: Tensor) -> Tensor:
-        angles = 7 * torch.exp(-torch.log(torch.tensor(1e4)) * torch.arange(128) / 128)
-        time = self["embed_timestep"]["mlp"](torch.cat([angles.cos(), angles.sin()]).to(x)[None])
+        time = self["embed_timestep"]["mlp"](make_sines(7).to(x))
         mixed = self["cond_emb"]["projections"](x.unflatten(-1, (3, 18)).transpose(-1, -2)).transpose(-1, -2)
         joints = torch.cat([torch.ones_like(mixed[..., :6]), mixed], -1).flatten(-2)
         h = self["input_process"]["poseEmbedding"](joints) + self.pos_embed
@@ -240,6 +252,158 @@ def denoise_still_motion(model: MotionModel, x: Tensor) -> Tensor:
     return torch.cat([part.unflatten(-1, (22, 6)) for part in (noise, variance)], -1)
 
 
+def group_by_tracker(x: Tensor) -> Tensor:
+    parts = x.split([18, 18, 9, 9], -1)
+    return torch.cat([part.unflatten(-1, (3, -1)) for part in parts], -1)
+
+
+class JointLevel(nn.ModuleDict):
+    """AvatarJLM; rotations of its coarse pose are those of tests/motion/test_geometry.py."""
+
+    def __init__(self) -> None:
+        lists = {name: nn.ModuleList(make_encoder(1) for _ in range(DEPTH)) for name in ("STB", "TTB")}
+        leaky = nn.LeakyReLU(0.1)
+        head = nn.Sequential(nn.Linear(45 * D, 2 * D), nn.GroupNorm(8, 2 * D), leaky, nn.Linear(2 * D, 132))
+        coarse = nn.Sequential(nn.Linear(2 * D, 2 * D), leaky, nn.Linear(2 * D, 132))
+        motion = nn.ModuleDict({"transformer": nn.ModuleDict(lists), "param_regressor": head})
+        motion.temp_embed = nn.Parameter(torch.randn(1, 200, 1, D))
+        motion.joint_position_embed = nn.Parameter(torch.randn(1, 1, 45, D))
+        super().__init__({
+            "linear_embedding_static": nn.Linear(396, 2 * D), "motion_net": motion,
+            "joint_regressor": nn.ModuleDict({"regressor": coarse, "body_model": nn.BatchNorm1d(3)}),
+            "position_embedding": nn.Linear(3, D), "rotation_embedding": nn.Linear(6, D),
+            "input_token_embedding": nn.Linear(2 * D, D),
+        })  # fmt: skip
+
+    def place_joints(self, embedded: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        columns = complete_columns(self["joint_regressor"]["regressor"](embedded).unflatten(-1, (22, 6)))
+        pelvis = torch.zeros_like(columns[..., 0, :, 0])
+        turned, _ = forward_kinematics(columns, pelvis, tiny.REST.to(columns))
+        _, places = forward_kinematics(convert_almost_rotations(columns), pelvis, tiny.REST.to(columns))
+        places, turned = places - places[..., 15:16, :], matrix_to_sixd(turned)
+        places[..., [15, 20, 21], :] = seen[..., 12:15] - seen[..., :1, 12:15]
+        turned[..., [15, 20, 21], :] = seen[..., :6]
+        return places, turned
+
+    def forward(self, x: Tensor) -> Tensor:
+        seen, motion = group_by_tracker(x), self["motion_net"]
+        joints = torch.full((*x.shape[:2], 22, 18), 0.01).to(x)
+        joints[..., [15, 20, 21], :] = seen
+        embedded = self["linear_embedding_static"](joints.flatten(-2))
+        places, turned = self.place_joints(embedded, seen)
+        tokens = self["position_embedding"](places), self["rotation_embedding"](turned)
+        h = torch.cat([*tokens, self["input_token_embedding"](embedded)[..., None, :]], -2)
+        h = h + motion.joint_position_embed + motion.temp_embed[:, :T]
+        first = h[..., -1:, :]
+        for over_joints, over_frames in zip(*motion["transformer"].values(), strict=True):
+            h = torch.cat([over_joints(h[0])[None, :, :-1], first], -2)
+            h = torch.cat([over_frames(h[0].transpose(0, 1)).transpose(0, 1)[None, :, :-1], first], -2)
+        return motion["param_regressor"](h.flatten(-2)[0])[None]
+
+
+class Condition(nn.ModuleDict):
+    """The inputs of SAGE-Net's parts at half of the frames."""
+
+    def __init__(self, width: int, **more: nn.Module) -> None:
+        super().__init__({"cond_encoder": nn.Conv1d(3, 22, 1), "cond_encoder2": nn.Linear(396, width)} | more)
+
+    def condition(self, x: Tensor, shorten: nn.Module) -> Tensor:
+        mixed = self["cond_encoder"](group_by_tracker(x)[0]).flatten(1)
+        return shorten(self["cond_encoder2"](mixed)[None])
+
+
+class HalfDenoiser(Condition):
+    def __init__(self, lower: bool) -> None:
+        parts = {
+            "embed_timestep": nn.ModuleDict({"mlp": make_mlp_head(256, D, nn.SiLU)}),
+            "sparse_up_conv": nn.Conv1d(T, T // 2, 1), "down_dim": nn.Linear(D + 384, D),
+            "blocks": nn.ModuleList(ModulatedBlock(4) for _ in range(DEPTH)), "last": nn.Linear(D, 384),
+            "upper_align_net" if lower else "align_net": nn.Conv1d(T // 2, T // 2, 1),
+        }  # fmt: skip
+        parts |= {"down_dim_init": nn.Linear(768, 384)} if lower else {}
+        super().__init__(D, denoiser_upper=nn.ModuleDict(parts))
+        self.lower = lower
+
+    def sample(self, x: Tensor, noise: Tensor, upper: Tensor | None) -> Tensor:
+        """One step of deterministic DDIM, from time 25 of 50 to time 0."""
+        part = self["denoiser_upper"]
+        latent = noise if upper is None else part["down_dim_init"](torch.cat([upper, noise], -1))
+        latent = part["upper_align_net" if self.lower else "align_net"](latent)
+        h = part["down_dim"](torch.cat([self.condition(x, part["sparse_up_conv"]), latent], -1))
+        for block in part["blocks"]:
+            h = block(h, part["embed_timestep"]["mlp"](make_sines(25).to(x)))
+        clean = part["last"](h)
+        steps = torch.tensor([0.0, 26.0, 1.0], dtype=torch.float64) / 50
+        start, here, there = ((steps + 0.008) / 1.008 * torch.pi / 2).cos().square()
+        here, there = (here / start).float(), (there / start).float()  # the schedule is float32
+        return there.sqrt() * clean + (1 - there).sqrt() * (noise - here.sqrt() * clean) / (1 - here).sqrt()
+
+
+class StackBlock(nn.ModuleDict):
+    """A block of SAGE-Net's decoder."""
+
+    def __init__(self) -> None:
+        attention = {name: nn.Linear(D, D) for name in ("key", "query", "value", "proj")}
+        mlp = nn.Sequential(nn.Linear(D, 4 * D), nn.GELU(), nn.Linear(4 * D, D), nn.Dropout())
+        norms = {name: nn.LayerNorm(D) for name in ("ln1", "ln2")}
+        super().__init__({"attn": nn.ModuleDict(attention), "mlp": mlp} | norms)
+
+    def forward(self, h: Tensor) -> Tensor:
+        layers, seen = self["attn"], self["ln1"](h)
+        parts = (layers[name](seen).unflatten(-1, (HEADS, -1)) for name in ("query", "key", "value"))
+        attended = F.scaled_dot_product_attention(*(part.transpose(1, 2) for part in parts))
+        h = h + layers["proj"](attended.transpose(1, 2).flatten(2))
+        return h + self["mlp"](self["ln2"](h))
+
+
+class PoseDecoder(Condition):
+    """SAGE-Net's decoder."""
+
+    def __init__(self) -> None:
+        stack = nn.ModuleDict({
+            "pos": nn.ModuleList([nn.Identity()]), "up_conv": nn.ModuleDict(
+                {"conv": nn.ConvTranspose1d(D, D, 3, 2)}
+            ),
+            "blocks": nn.ModuleList(StackBlock() for _ in range(DEPTH)), "ln_f": nn.LayerNorm(D),
+            "head": nn.Linear(D, D, bias=False),
+        })  # fmt: skip
+        angles = torch.arange(T)[:, None] / 10_000 ** (torch.arange(0, D, 2) / D)
+        pe = torch.stack([angles.sin(), angles.cos()], -1).flatten(1)[None]
+        stack["pos"][0].register_buffer("pe", pe)
+        heads = {"reg_body": make_mlp_head(D, 126), "reg_root": make_mlp_head(D, 6)}
+        shorten, stem = nn.Conv1d(T, T // 2, 1), nn.Linear(3 * 384, D)
+        stacks = nn.ModuleList([stack])
+        super().__init__(384, sparse_up_conv=shorten, post_quant_emb=stem, decoder_stacks=stacks, **heads)
+
+    def forward(self, upper: Tensor, lower: Tensor, x: Tensor) -> Tensor:
+        (stack,), seen = self["decoder_stacks"], self.condition(x, self["sparse_up_conv"])
+        h = self["post_quant_emb"](torch.cat([seen, upper, lower], -1))
+        h = h + stack["pos"][0].pe[:, : T // 2]
+        for block in stack["blocks"]:
+            h = block(h)
+        h = stack["up_conv"]["conv"](h.transpose(1, 2))[..., 1:].transpose(1, 2)
+        h = stack["head"](stack["ln_f"](h))[:, -1:]
+        return torch.cat([self["reg_root"](h), self["reg_body"](h)], -1)
+
+
+class Stratified(nn.ModuleDict):
+    """SAGE-Net, sampled with noise that the test sets."""
+
+    noise: Tensor
+
+    def __init__(self) -> None:
+        parts = {"upper": HalfDenoiser(False), "lower": HalfDenoiser(True), "decoder": PoseDecoder()}
+        super().__init__({f"{name}_state_dict": part for name, part in parts.items()})
+
+    def make_file(self) -> dict[str, object]:
+        return {"epoch": 3} | {name: part.state_dict() for name, part in self.items()}
+
+    def forward(self, x: Tensor) -> Tensor:
+        upper_part, lower_part, decoder = self.values()
+        upper = upper_part.sample(x, self.noise[:1].to(x), None)
+        return decoder(upper, lower_part.sample(x, self.noise[1:].to(x), upper), x)
+
+
 TRANSFORMER = {"depth": DEPTH, "heads": HEADS, "width": D, "feedforward": WIDE, "dropout": 0.1}
 RELEASED = {
     "avatar_poser": (lambda: Poser("stabilizer", 54, False), {"frames": T, **TRANSFORMER}),
@@ -248,6 +412,11 @@ RELEASED = {
     "agrol_diffusion": (Denoiser, {"diffusion_steps": 50, "sampling_steps": 1, "sampler": "posterior"}),
     "hmd_poser": (HMD, {"frames": T, "heads": HEADS, "dropout": 0.1, "shape_weight": 0.1}),
     "rpm": (Rolling, {"frames": 20, "bounded_first": True, "own_dropout": False, **TRANSFORMER}),
+    "avatar_jlm": (JointLevel, {"frames": T, "heads": HEADS, "dropout": 0.1, "coarse_weight": 1.0}),
+    "sage": (Stratified, {
+        "heads": HEADS, "code_heads": HEADS, "dropout": 0.1, "diffusion_steps": 50, "sampling_steps": 2,
+        "sampler": "strided", "noise": 0.01, "noise_seed": 0,
+    }),
     "bodiffusion": (JointDenoiser, {"heads": HEADS, "sampling_steps": 2, "noise_weight": 1.0}),
 }  # fmt: skip
 
@@ -257,13 +426,19 @@ def make_released(name: str) -> nn.Module:
     return RELEASED[name][0]().eval()
 
 
+def make_file(released: nn.Module) -> dict[str, object]:
+    if isinstance(released, Stratified):
+        return released.make_file()
+    return {"state_dict": released.state_dict(), "epoch": 3}
+
+
 def import_tensors(name: str, path: Path) -> MotionModel:
     network, (_, sizes) = find_component("model", name), RELEASED[name]
     tensors, release = checkpoint.read_published(path), network.settings.release
-    tensors = network.kind.adapt_published(tensors)
     found = {key.split(".")[1]: n for key, n in checkpoint.find_published_sizes(tensors, release).items()}
     settings = network.make_settings({**sizes, **found})
     model = network.kind(Normalizer.from_coordinates(World(), tiny.REST), settings)
+    tensors = network.kind.adapt_published(tensors)
     renamed = checkpoint.rename_published(tensors, release, dict(model.named_parameters()))
     model.load_state_dict(renamed, strict=False)
     return model.eval().double()
@@ -273,9 +448,10 @@ def import_tensors(name: str, path: Path) -> MotionModel:
 @torch.no_grad()
 def test_an_imported_network_computes_what_the_released_layers_compute(name: str, tmp_path: Path) -> None:
     released = make_released(name)
-    torch.save({"state_dict": released.state_dict(), "epoch": 3}, tmp_path / "net.pth")
+    torch.save(make_file(released), tmp_path / "net.pth")
     model = import_tensors(name, tmp_path / "net.pth")
-    released.double().noise = getattr(model, "noise", torch.zeros(1))[0]
+    noise = getattr(model, "noise", torch.zeros(1))[0]
+    released.double().noise = getattr(model, "noises", noise)
     inputs = {"avatar_poser": X, "ego_poser": X, "rpm": X[:, :1]}.get(name, X[:, -T:])
     expected = released(inputs)
     if name == "bodiffusion":
@@ -380,3 +556,52 @@ def test_the_command_makes_a_finished_run_that_names_its_origin(tmp_path: Path) 
     )
     assert found.id in repeated
     assert len(list_runs(tmp_path / "outputs")) == 1
+
+
+REFINED = "sage with its refiner"
+OPTIONS = {
+    "avatar_poser": ["model.frames=8", "model.heads=4"], "ego_poser": ["model.frames=8", "model.heads=4"],
+    "hmd_poser": ["model.frames=8", "model.heads=4"], "avatar_jlm": ["model.frames=8", "model.heads=4"],
+    "agrol_diffusion": ["model.diffusion_steps=50", "model.sampling_steps=2"],
+    "sage": ["model.heads=4", "model.code_heads=4", "model.diffusion_steps=50", "model.sampling_steps=2"],
+    "bodiffusion": ["model.heads=4", "model.sampling_steps=2", "model.offline=false", "export.graph=auto"],
+    "rpm": ["model.heads=4"],
+}  # fmt: skip
+OPTIONS[REFINED] = [*OPTIONS["sage"], "--refiner", "refiner.pth.tar"]
+
+
+def make_refiner_file() -> dict[str, object]:
+    parts = nn.ModuleDict({"refine_net": nn.GRU(132, 8, 2, batch_first=True), "linear": nn.Linear(8, 132)})
+    return {"epoch": 3, "state_dict": parts.state_dict()}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", [*RELEASED, REFINED])
+def test_an_imported_network_streams_is_exported_and_timed(kind: str, tmp_path: Path) -> None:
+    """In the oldest and the newest opset; its costs and errors stand in official tables."""
+    name = "sage" if kind == REFINED else kind
+    torch.save(make_file(make_released(name)), tmp_path / "net.pth")
+    torch.save(make_refiner_file(), tmp_path / "refiner.pth.tar")
+    words = ["import-weights", name, "net.pth", *BRIEF[2:], *OPTIONS.get(kind, []), "profile=tiny"]
+    words = [word for word in words if not word.startswith("model.depth")]
+    opsets = (15, min(OPSETS[-1], onnx.defs.onnx_opset_version()))
+    for opset in opsets:
+        words += ["evaluation.modes=[stream,window]", "export.latency_steps=2"]
+        run(tmp_path, *words, f"export.opset={opset}")
+    (imported,) = find_imported_runs(tmp_path / "outputs")
+    graphs = [onnx.load(path) for path in imported.run.folder.rglob("step.onnx")]
+    assert {one.version for graph in graphs for one in graph.opset_import} == set(opsets)
+    source = find_component("model", name).settings.release.source
+    assert all(source in str(graph.metadata_props) for graph in graphs)
+    variant = Variant("V", (f"model={name}", *(["refiner=sage"] if kind == REFINED else [])))
+    metrics = ("MPJPE", "parameters", "ms")
+    sweep = Sweep("t", "T", 1, (), ("data=synth",), (0,), (variant,), variant.label, metrics)
+    for mode in ("stream", "window"):
+        _, row, _ = list_official_values(sweep, {}, [imported], [mode])
+        assert "net.pth" in row[1]
+        assert all(float(cell) > 0 for cell in row[3:5])
+    other = replace(
+        variant, overrides=(f"model={name}", "refiner=sage" if kind != REFINED else "refiner=null")
+    )
+    changed = replace(sweep, variants=(other,))
+    assert list_official_values(changed, {}, [imported], ["window"])[1][-1] == ""

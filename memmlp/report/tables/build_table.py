@@ -94,18 +94,20 @@ def list_official_values(
     """Return rows that compare published values with those of imported weights and of trainings.
 
     Each row has a variant's label, the weights ("published", the file of imported weights or "trained here"),
-    the mode and the metrics. Imported weights belong to a variant with the same network and data.
+    the mode and the metrics. Imported weights belong to a variant with the same network, refiner and data.
     """
     rows = []
     for variant in sweep.variants:
         chosen = select_last_by_key((*sweep.base, *sweep.command_line, *(variant.overrides or ())))
-        model, data = (chosen[key].value if key in chosen else None for key in ("model", "data"))
+        keys = ("model", "data", "refiner")
+        model, data, refiner = (chosen[key].value if key in chosen else None for key in keys)
         theirs = [
             one
             for one in imported
             if one.run
             and (one.run.manifest["imported"]["model"] == model)
             and data in (None, one.run.config["data"]["name"])
+            and refiner in ("null", (one.run.config["refiner"] or {}).get("name"))
         ]
         trained = list(runs.get(variant.label, {}).values())
         printed = variant.paper or {}
