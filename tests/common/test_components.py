@@ -16,7 +16,6 @@ from memmlp.common.components import (
     list_component_names,
 )
 from memmlp.common.errors import InputError
-from memmlp.networks.avatar_poser import EgoPoser, EgoPoserSettings
 
 TORCH_FREE = """
 import sys
@@ -79,17 +78,6 @@ def test_every_shipped_component_can_be_imported_and_others_are_refused():
     assert set(SLOTS) - {"term"} <= {slot for slot, _ in collect_components()}
     with pytest.raises(InputError, match=r"memory=mamba: must be gru or lstm"):
         find_component("memory", "mamba")
-
-
-def test_declared_settings_and_those_of_the_module_are_the_same():
-    found = find_component("model", "ego_poser")
-    assert found.kind is EgoPoser
-    assert found.settings is not EgoPoserSettings  # it was read without an import
-    assert [spec for spec in found.settings.__dataclass_fields__] == [*EgoPoserSettings.__dataclass_fields__]
-    assert (found.version, found.package, found.module) == (2, "memmlp", "memmlp.networks.avatar_poser")
-    assert collect_attribute(found.settings, "defaults") == {
-        "memory": None, "predictor": None, "hand": None, "loss": "ego_poser",
-    }  # fmt: skip
 
 
 @pytest.fixture

@@ -62,14 +62,6 @@ def test_splines_are_nearer_to_smooth_motion_than_lines_and_have_its_jerk(fps):
     assert kinks > (3 if fps <= 30 else 1.4)
 
 
-@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
-def test_recorded_frames_stay(interpolation):
-    recorded = Clip("a", *swinging(np.arange(31) / 30), 30.0)
-    clip, _ = resample(recorded, interpolation=interpolation)
-    assert turned(clip.poses[::2], recorded.poses).max() < 1e-9
-    np.testing.assert_allclose(clip.trans[::2], recorded.trans, atol=1e-9)
-
-
 def test_pieces_are_the_clip():
     poses, trans = analytic(np.arange(7.0))
     for frames, lengths in ((3, [3, 3, 1]), (7, [7]), (100, [7])):

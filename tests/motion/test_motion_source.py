@@ -1,5 +1,7 @@
 """The source of an experiment's motion: what is refused of a list that isn't all there."""
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
@@ -89,3 +91,26 @@ def test_nothing_goes_on_with_clips_that_are_others_by_now(root):
     assert len(now.open("train")) > 0
     with pytest.raises(InputError, match="other clips"):
         before.open("train")
+
+
+def test_a_full_disk_leaves_no_half_of_synthetic_motion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    root, write, room = tmp_path / "synth", np.savez, [2]
+
+    def save(file, **arrays) -> None:
+        room[0] -= 1
+        if room[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(file, **arrays)
+
+    def generate(folder: Path) -> None:
+        for name in "abcd":
+            write_clip(folder / f"{name}/{name}.npz", still(50))
+
+    split = SeededSplit(val=0.3, test=0.3)
+    made = MotionSource(ClipFolder(root, split), generate, tmp_path / "cache")
+    monkeypatch.setattr(np, "savez", save)
+    with pytest.raises(OSError, match=r"No space left on device: '.*c\.npz'"):
+        made.prepare()
+    assert [path for path in tmp_path.rglob("*") if ".lease-" not in path.name] == []
+    room[0] = 4
+    assert len(made.prepare().manifest.clips) == 4

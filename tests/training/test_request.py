@@ -1,10 +1,8 @@
 """Remarks on data before a run, and warnings in its manifest for tables."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 from unittest import mock
 
-from memmlp.motion.clip import SkippedFile
 from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
 from memmlp.training import request
 
@@ -19,16 +17,6 @@ def warnings(clips: list[SimpleNamespace], name: str = "mine", part: dict | None
     return request.collect_data_warnings(
         {"data": {"name": name, "split": part or {}}}, SimpleNamespace(manifest=manifest)
     )
-
-
-def test_remarks_count_the_clips_and_name_the_first():
-    bad = SkippedFile("b.npz", "NaN in frame 3")
-    assert request.describe_skipped_files([]) is request.describe_unusual_clips({}) is None
-    for word in ("2 files", "b.npz (NaN in frame 3)", "data.strict"):
-        assert word in str(request.describe_skipped_files([bad, replace(bad, file="c.npz")]))
-    odd = {"a/1": "Z is not up", "a/2": "Z is not up", "b": "the pelvis is at z = 20 m", "c": "Z is not up"}
-    for word in ("4 clips", "a/1 (Z is not up), a/2, b", "memmlp data inspect"):
-        assert word in str(request.describe_unusual_clips(odd))
 
 
 def test_single_groups_and_divided_persons_are_facts_of_the_run():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from live.session.conftest import PERSON
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
@@ -32,7 +33,7 @@ from memmlp.live.session.sources import (
 )
 from memmlp.live.tracker_input import TrackerReader
 from memmlp.live.tracker_resampling import TRACKERS
-from memmlp.motion.body import make_builtin_rest_joints
+from memmlp.motion.body import SPARSE_POSITION, SPARSE_ROTATION, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 
@@ -84,6 +85,17 @@ def test_a_lost_hand_leaves_the_packet_s_other_trackers(kind: str, left: list[fl
     text = encode_osc((f"/memmlp/{key}", "f" * len(v or ()), map(float, v or ())) for key, v in given.items())
     packet = back(text if kind == "osc" else json.dumps(given).encode())
     assert TrackerReader(60).read(packet.trackers)[2] == (False, True, False)
+
+
+@pytest.mark.parametrize("value", [0.0, math.nan])
+def test_a_clip_s_lost_hand_is_lost_between_its_frames_too(value: float):
+    frames = PERSON.frames.numpy().copy()
+    frames[10:15, SPARSE_POSITION][:, 3:6] = value
+    frames[30:35, SPARSE_ROTATION][:, 6:12] = value
+    clip = TrackedClip("person", frames)
+    for frame in np.arange(5.1, 40, 0.4):
+        lost = TrackerReader(60).read(clip.interpolate_trackers(frame / 60))[2]
+        assert lost == (False, any(first - 1 < frame < first + 5 for first in (10, 30)), False), frame
 
 
 def test_bad_packets_are_rejected():

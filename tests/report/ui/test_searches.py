@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_search import director, finish, open_study, with_a_pruned_trial
+from fake_search import director, finish, open_study
 
 from memmlp.common.files import write_json
 from memmlp.report.ui.searches import Searches
@@ -16,14 +16,6 @@ def folder(tmp_path: Path) -> Path:
     folder = tmp_path / "outputs/tune/mine"
     folder.mkdir(parents=True)
     return folder
-
-
-def test_a_pruned_trial_has_no_value(folder: Path):
-    study = with_a_pruned_trial(folder)
-    write_json(folder / "search.json", asdict(study.search))
-    first, second, *_ = Searches(folder.parents[1]).describe("mine")["trials"]
-    assert (first["state"], first["values"]) == ("complete", [5.0])
-    assert (second["state"], second["values"], second["reason"]) == ("pruned", [], "9 at step 10")
 
 
 def test_a_search_in_a_custom_storage_is_read_again(folder: Path, tmp_path: Path):
