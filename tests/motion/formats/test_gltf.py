@@ -58,6 +58,18 @@ def test_times_are_exact_and_quaternions_keep_their_sign(glb: Glb, tmp_path: Pat
     assert Glb(tmp_path / "one.glb").channels()["pelvis", "rotation"][0].tolist() == [0]
 
 
+def test_the_mannequin_moves_with_the_joints(glb: Glb):
+    """Each vertex is as far from its joint as in the bind pose; head and hands follow their own joints."""
+    attributes = glb.json["meshes"][0]["primitives"][0]["attributes"]
+    owner = glb.array(attributes["JOINTS_0"])[:, 0]
+    assert set(owner) == set(range(22)) - {JOINTS.index("left_foot"), JOINTS.index("right_foot")}
+    still = np.stack([glb.matrices(None)[joint][:3, 3] for joint in JOINTS])[owner]
+    reach = np.linalg.norm(glb.array(attributes["POSITION"]) - still, axis=1)
+    for frame in (0, 17, len(CLIP) - 1):
+        moved = JOINTS_Y_UP[frame][owner]
+        np.testing.assert_allclose(np.linalg.norm(glb.vertices(frame) - moved, axis=1), reach, atol=1e-5)
+
+
 REQUIRED = {
     "hips", "spine", "head", "leftUpperLeg", "leftLowerLeg", "leftFoot", "rightUpperLeg", "rightLowerLeg",
     "rightFoot", "leftUpperArm", "leftLowerArm", "leftHand", "rightUpperArm", "rightLowerArm", "rightHand",
