@@ -82,7 +82,7 @@ def sixd_to_matrix(sixd: Tensor) -> Tensor:
     along = a * d + b * e + c * f
     d, e, f = _normalize(d - along * a, e - along * b, f - along * c)
     columns = [a, b, c, d, e, f, b * f - c * e, c * d - a * f, a * e - b * d]
-    return torch.stack(columns).unflatten(0, (3, 3)).movedim((1, 0), (-2, -1))
+    return torch.stack(columns).unflatten(0, (3, 3)).movedim((1, 0), (-2, -1)).contiguous()
 
 
 def _normalize(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:

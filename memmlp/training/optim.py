@@ -59,7 +59,7 @@ class OptimSettings(Settings):
     warmup: int | float = setting(steps_or_fraction(), 0)
     clip_norm: float = setting(at_least(0), 0.0)  # maximum norm of the gradient; 0: no limit
     precision: str = setting(one_of("fp32", "bf16"), "fp32")
-    compile: bool = setting(default=False)  # true: compile the network with torch.compile
+    compile: bool = setting(default=False)  # true: compile network and loss with torch.compile
     # number of steps between checkpoints
     checkpoint_every: int = setting(at_least(1), "${profile.checkpoint_every}")
     # number of steps between validations; below 1: a fraction of all steps

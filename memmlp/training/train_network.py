@@ -206,8 +206,10 @@ class MotionTask(TrainingTask):
         self.model, self.loss, self.rollout, self.dataset = model, loss, rollout, dataset
         self.module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
         self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, drawn_by, shares)
-        compute = model.compute_training_outputs
-        self.compute_training_outputs = torch.compile(compute) if optim.compile else compute
+        self.compute_training_outputs, self.compute_loss = model.compute_training_outputs, loss.forward
+        if optim.compile:
+            self.compute_training_outputs = torch.compile(self.compute_training_outputs)
+            self.compute_loss = torch.compile(self.compute_loss)
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
@@ -221,7 +223,7 @@ class MotionTask(TrainingTask):
         members = len(motion) // len(call.true_frames)  # a network may return the motion of several
         truth = call.true_frames[:, -motion.shape[1] :].expand(members, -1, -1, -1).flatten(0, 1)
         sparse, truth = truth[..., :SPARSE_DIM], truth[..., SPARSE_DIM:]
-        loss, terms = self.loss(motion, truth, sparse, self.model.normalizer)
+        loss, terms = self.compute_loss(motion, truth, sparse, self.model.normalizer)
         return StepResult(sum(losses.values(), loss), terms | losses, call.clips)
 
     def average_over_draws(self, measure: Callable[[], float]) -> float:
