@@ -17,7 +17,6 @@ from own_package import PACKAGE, registers_kept
 
 from memmlp.cli.main import commands
 from memmlp.cli.workers import Workers, split_executor
-from memmlp.common.components import list_component_names as component_names
 from memmlp.config.build import build_untrained
 from memmlp.config.compose import compose_config, compose_jobs, compose_plain, parse_hydra_arguments
 from memmlp.config.compose_plan import find_sweep
@@ -299,16 +298,3 @@ def test_examples_of_the_guides_work(tmp_path: Path, monkeypatch: pytest.MonkeyP
         compose_config(one.overrides)
     skeleton = yaml.safe_load(examples("motion", "yaml")[0])
     assert set(skeleton) == set(SkeletonMap.__dataclass_fields__)
-
-
-def test_the_page_of_switches_lists_every_option():
-    text = (DOCS / "guides" / "switches.md").read_text(encoding="utf-8")
-    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", text, re.MULTILINE))
-    groups = {name for name in rows if (ROOT / "conf" / name).is_dir() or component_names(name)}
-    assert {"model", "memory", "loss", "rollout"} <= groups
-    for group in sorted(groups):
-        files = (path.stem for path in (ROOT / "conf" / group).glob("*.yaml"))
-        options = {*files, *component_names(group)}
-        named = set(re.findall(r"`([a-z_0-9]+)`", rows[group]))
-        assert options <= named, group
-        assert named - options <= {"null", "batch", "lr", "drops", "drop"}, group  # keys beside option names

@@ -149,14 +149,6 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
     assert one_line(memmlp(*SWEEP), "rounds.json: damaged")
 
 
-@pytest.mark.slow
-def test_what_is_kept_has_the_seeds_of_all_rounds(memmlp: Memmlp, runs: Runs):
-    memmlp(*SWEEP)
-    memmlp("results", "save", "trial.yaml", "--name", "chosen", "seed=0,1,2")
-    memmlp("results", "save", "trial.yaml")
-    assert one_line(memmlp("results", "save", "trial.yaml", "seed=0,1,2"), "trial.json", "seed 3")
-
-
 def test_bad_combinations_are_one_line(memmlp: Memmlp, runs: Runs):
     assert one_line(memmlp("sweep", "trial.yaml", "--max-seeds", "5"), "--max-seeds: ")
     assert one_line(memmlp(*SWEEP, "--max-seeds", "2"), "--max-seeds 2: must be at least 3")

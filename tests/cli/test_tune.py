@@ -128,33 +128,3 @@ def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(InputError, match="mine: clips have changed since the search started"):
         search(setup, study, Workers())
     assert len(study.trials) == 1
-
-
-def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
-    outputs = tmp_path / "outputs"
-    shutil.copytree(home / "outputs", outputs)
-    path = next((outputs / "tune").iterdir()) / "trials.csv"
-    head, first, second = path.read_text().splitlines()
-    path.write_text("\n".join([head, first, first, second.replace("complete", "running")]))
-    said = "\n".join(examine(outputs, 2))
-    assert all(words in said for words in ("3 trials, not 2", "of 2 trials", "trial 1: running"))
-    path.write_text("\n".join([head, re.sub(r",\d", ",9", first, count=1)]))
-    said = "\n".join(examine(outputs, 1))
-    assert all(words in said for words in ("trial 0: not the mean of its runs", "of no trial"))
-
-
-@pytest.mark.long
-def test_every_trial_trains_for_the_same_compute(tmp_path: Path):
-    """The batch is searched, and so is the number of steps; the objective is of the best validation."""
-    budget, own = 0.001, [word for word in TINY if "steps" not in word and "validate" not in word]
-    space = ["search.space.optim=null", "+search.space.optim.batch={choices: [4, 8]}"]
-    words = ["search=learning_rate", "search.n_trials=2", f"search.tflop={budget}"]
-    run_apart(tmp_path, "tune", *own, *words, *space, "--workers", "1")
-    rows = read_trials(folder_of(tmp_path))
-    runs = [Run.from_id(tmp_path / "outputs", row["run"]) for row in rows]
-    assert [run.manifest["tflop"] for run in runs] == pytest.approx([budget, budget], rel=0.05)
-    assert runs[0].total_steps > 1.4 * runs[1].total_steps
-    for row, run in zip(rows, runs, strict=True):
-        errors = [e.values["rotation MPJPE"] for e in run.metrics() if e.phase == "val"]
-        assert len(errors) in (5, 6)
-        assert float(row["MPJPE"]) == min(errors)

@@ -72,14 +72,11 @@ def test_the_last_of_several_choices_wins_and_texts_are_kept(monkeypatch: pytest
 BAD = {
     "unknown keys": [
         (["model.widht=3"], ["model.widht", "did you mean width?", "frames, width, depth"]),
-        (["data.split.tset=0.1"], ["data.split.tset", "did you mean test?"]),
         (["memory=none", "memory.width=3"], ["memory.width"]), (["loss.rotation=3"], ["loss.rotation", "lr"]),
         (["--cfg", "job", "model.widht=3"], ["model.widht", "did you mean width?"]),
     ],
     "wrong types": [
         (["model.width=abc"], ["model.width=abc", "an integer"]),
-        (["optim.lr=fast"], ["optim.lr=fast", "a number"]),
-        (["memory.layers=3"], ["memory.layers=3", "a list"]),
         (["model.width=${profile.schedule}"], ["model.width", "Integer"]),
     ],
     "unknown options": [
@@ -90,7 +87,6 @@ BAD = {
     "out of range": [
         (["model.width=0"], ["model.width=0", "at least 1"]),
         (["optim.lr=nan"], ["optim.lr=nan", "above 0"]), (["optim.lr=inf"], ["optim.lr=inf", "above 0"]),
-        (["optim.schedule=linear"], ["optim.schedule=linear", "step or cosine"]),
         (["memory.blend=1.5"], ["memory.blend=1.5", "at most 1 or sampled"]),
         (["memory.layers=[2,2]"], ["memory.layers=[2, 2]", "without repetitions"]),
         (["vqvae.steps=null", "vqvae.epochs=0"], ["vqvae.epochs=0", "above 0"]),
@@ -99,7 +95,6 @@ BAD = {
     "impossible combinations": [
         (["~memory"], ["memory", "none for no memory"]),
         (["memory.layers=[2,9]"], ["memory.layers=[2, 9]", "model.depth=8"]),
-        (["optim.final_lr=1"], ["optim.final_lr=1", "optim.lr"]),
         (["predictor=two_branch_memory", "predictor.depth=0"], ["predictor.depth=0"]),
         (["loss=avatar_poser"], ["loss=avatar_poser", "uncertainty or manual"]),
         (["vqvae.epochs=3"], ["vqvae.epochs=3.0, vqvae.steps=2000", "null"]),
@@ -114,19 +109,15 @@ BAD = {
     ],
     "missing values": [
         (["data=mocap"], ["data.root", "no value"]),
-        (["data=mocap", "data.root=nowhere"], ["data.root=nowhere", "an existing folder"]),
         (["data.root=${oc.env:NOT_SET}"], ["data.root", "NOT_SET"]),
-        (["model.width=${profile.nope}"], ["model.width", "profile.nope"]),
         (["~model.width"], ["model.width", "cannot be removed"]),
     ],
     "broken command lines": [
-        (["model.width"], ["model.width", "KEY=VALUE"]), (["model.width=["], ["model.width=[", "KEY=VALUE"]),
         (["--no-such-flag"], ["--no-such-flag"]), (["-m", "--cfg", "job"], ["--multirun, --cfg", "only one"]),
         (["--config-dir", "nowhere"], ["nowhere", "existing folder"]),
     ],
     "a bad second job, before the first starts": [
         (["-m", "model.width=16,-1"], ["model.width=-1", "at least 1"]),
-        (["-m", "memory=vq,mamba"], ["memory=mamba", "no_codes, none, vq"]),
         (["-m", "model={width:16},{width:32}", "model={depth:3}"], ["model={depth:3}", "model={width:16}"]),
     ],
 }  # fmt: skip

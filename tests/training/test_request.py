@@ -7,30 +7,12 @@ from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
 from memmlp.training import request
 
 
-def clip(name: str, split: str, fps: float = 60.0, group: str = "tied") -> SimpleNamespace:
-    return SimpleNamespace(name=name, split=split, fps=fps, group=group)
-
-
 def warnings(clips: list[SimpleNamespace], name: str = "mine", part: dict | None = None, **facts) -> dict:
     whole = {"coverage": SimpleNamespace(is_complete=True), "listed": {"CMU": 1}, "split": {}, "unusual": {}}
     manifest = SimpleNamespace(clips=clips, **(whole | facts))
     return request.collect_data_warnings(
         {"data": {"name": name, "split": part or {}}}, SimpleNamespace(manifest=manifest)
     )
-
-
-def test_single_groups_and_divided_persons_are_facts_of_the_run():
-    for groups, counts, few in (("abb", ("3", "2"), False), ("aa", ("2", "1"), True)):
-        clips = [clip("c", "train"), *(clip("t", "test", group=group) for group in groups)]
-        found = request.describe_test_clips(clips)
-        assert all(count in found for count in counts)
-        assert ("data.split.test" in found) == few
-    names = (("CMU/01/a", "train"), ("CMU/01/b", "test"), ("CMU/02/c", "train"))
-    clips = [clip(name, part, group=name) for name, part in names]
-    found = warnings(clips)
-    assert "CMU/01" in found["divided"]
-    assert found["partial"] is found["resampled"] is found["unusual"] is None
-    assert warnings(clips, split={"kind": "lists"})["divided"] is None
 
 
 def test_a_part_of_the_data_or_of_a_protocol_is_told():

@@ -114,15 +114,6 @@ def test_the_lower_half_is_given_what_the_upper_one_samples():
     assert all(torch.equal(upper, expected) for (_, upper), _ in net.lower.merge_latents.call_args_list)
 
 
-def test_the_whole_is_trained_through_both_samplers():
-    net = tiny.baseline("sage")
-    state = net.running_state(FRAMES[:, :-1, :SPARSE_DIM])
-    motion, *_ = net.compute_training_outputs(FRAMES[:, -1:, :SPARSE_DIM], state, FRAMES)
-    assert motion.shape[1] == 1
-    motion[..., ROTATION].sum().backward()
-    assert all(part.stem.weight.grad.any() for part in (net.upper, net.lower, net.decoder))
-
-
 def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
     kept, parts = tiny.baseline("sage", seed=1), ("upper", "lower", "decoder")
     checkpoint.write(tmp_path / "model", checkpoint.collect_module_tensors("model", kept), {})

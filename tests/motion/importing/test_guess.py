@@ -90,12 +90,3 @@ def test_a_joint_without_a_known_name_is_left_to_the_user(tmp_path: Path):
         convert_with_guess(bvh, proposed)
     nothing = renamed(bvh, {joint: f"bone{number}" for number, joint in enumerate(joints(bvh))})
     assert "left_hip" in guess_map(nothing, "mine").missing
-
-
-def test_an_existing_map_is_not_replaced(tmp_path: Path):
-    path = write(tmp_path, "mine", "map.yaml")
-    with refuse("--out"):
-        write_map(path, "other")
-    assert path.read_text() == "mine"
-    with refuse("--out"):
-        write_map(tmp_path / "no" / "map.yaml", "other")

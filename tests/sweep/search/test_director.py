@@ -13,7 +13,6 @@ from optuna.trial import TrialState
 from memmlp.common.errors import InputError
 from memmlp.sweep.plan import RunTask
 from memmlp.sweep.search import study as study_module
-from memmlp.sweep.search.progress_table import format_objectives
 from memmlp.sweep.search.search_file import Value
 
 
@@ -107,19 +106,6 @@ def test_values_that_make_no_sense_fail_their_trial_and_hopeless_searches_end(tm
     refuse = Mock(side_effect=InputError("hand=position needs positions"))
     with pytest.raises(InputError, match="all 5 trials failed; the last error: hand=position needs"):
         fake_search.director(fake_search.open_study(tmp_path, n_trials=20), tmp_path, refuse).update(2)
-
-
-def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
-    study = fake_search.open_study(tmp_path, seeds=3, n_trials=2)
-    one = fake_search.seeded(study, tmp_path)
-    while (plan := one.update(1)).tasks:
-        fake_search.finish(plan)
-    for trial in study.trials:
-        first = fake_search.error({"values": trial.params, "seed": 0})
-        values = [value for (value,) in trial.user_attrs["values"]]
-        assert [trial.value, *values] == pytest.approx([first + 0.3, first, first + 0.3, first + 0.6])
-        assert format_objectives(trial) == f"{trial.value:.3f} ± 0.300"
-        assert len(set(trial.user_attrs["runs"])) == 3
 
 
 def test_the_other_seeds_wait_for_the_first_ones_end_and_count_for_capacity(tmp_path: Path):
