@@ -17,7 +17,7 @@ def small_yardstick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="package")
 def naive_step(tmp_path_factory: pytest.TempPathFactory) -> tuple[MotionModel, Path]:
-    """A network as it was trained; others are in tests/config/test_build.py, streams in exported.py."""
+    """A network as it was trained; streams are in exported.py."""
     path = tmp_path_factory.mktemp("onnx") / "step.onnx"
     path.write_bytes(golden.exported("graph.naive"))
     return tiny.model(), path
