@@ -577,9 +577,9 @@ class Point(NamedTuple):
 
 
 def has_frontier(table: Table) -> bool:
-    """Return whether the variants' training compute is known and differs."""
+    """Return whether at least three variants have a known training compute, and it differs."""
     known = [row.costs[COMPUTE] for row in table.rows if COMPUTE in row.costs]
-    return bool(table.measured_metrics) and len(known) > 1 and max(known) > MIN_RATIO * min(known)
+    return bool(table.measured_metrics) and len(known) > 2 and max(known) > MIN_RATIO * min(known)
 
 
 def choose_metric(table: Table) -> str:
