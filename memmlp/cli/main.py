@@ -13,7 +13,7 @@ import click
 
 import memmlp
 from memmlp.common import distributed
-from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged
 from memmlp.common.processes import collect_garbage_rarely, treat_termination_as_interrupt
 from memmlp.common.progress import send_announcements_to
 from memmlp.common.text_formats import print_in_any_encoding
@@ -138,7 +138,7 @@ def _choose_exit_code(error: Exception) -> int | None:
         return error.exit_code
     if isinstance(error, OSError) and error.strerror:
         return 2 if error.filename else 1  # 2 for a path from the user, 1 for a full or failing disk
-    if type(error) in (InputError, TrainingDiverged, LeaseLost):
+    if type(error) in (InputError, TrainingDiverged, LeaseLost, RunStopped):
         return 2 if type(error) is InputError else 1
     cause: BaseException | None = error  # may follow from a Ctrl-C, for example during an import
     while cause is not None and not isinstance(cause, KeyboardInterrupt):

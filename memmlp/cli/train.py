@@ -13,7 +13,7 @@ import hydra
 from omegaconf import DictConfig
 
 from memmlp.common import distributed
-from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged
 from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import parse_overrides
 from memmlp.config.check import explain_error
@@ -115,7 +115,7 @@ def _collect_failures(
     def train_from_config(cfg: DictConfig) -> None:
         try:
             job(cfg)
-        except (InputError, TrainingDiverged, LeaseLost, OSError) as failure:
+        except (InputError, TrainingDiverged, LeaseLost, RunStopped, OSError) as failure:
             if os.getpid() != collector:
                 raise
             failures.append(failure)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path) -> None:
     """Show runs, sweeps and searches on a local web page, with live updates.
 
-    The page never changes a run. Ctrl-C stops the server. docs/guides/ui.md describes the page.
+    Its buttons change runs like `memmlp runs`. Ctrl-C stops the server. docs/guides/ui.md describes the page.
     """
     import webbrowser
 
@@ -44,13 +44,29 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
 
     check_token(host, token)
     with (
-        RunsServer(Answers(outputs, predict), port, host, token) as server,
+        RunsServer(Answers(outputs, predict, make_command=make_command), port, host, token) as server,
         contextlib.suppress(KeyboardInterrupt),
     ):
         click.echo(f"{server.url}  runs in {outputs / 'runs'}; Ctrl-C ends")
         if not no_browser:
             webbrowser.open(server.url)
         threading.Event().wait()
+
+
+def make_command(run: Run) -> str:
+    """Return the command that trains a network's run again. Raises InputError if there is none."""
+    from memmlp.common.errors import InputError
+    from memmlp.common.text_formats import join_command
+    from memmlp.config.build import list_overrides
+    from memmlp.runs.identity import NETWORK
+
+    if run.manifest.get("kind") != NETWORK:
+        raise InputError(f"run {run.id}: has the command of the runs that need it")
+    with _compose_lock:
+        return join_command(["memmlp", "train", *list_overrides(run.config)])
+
+
+_compose_lock = threading.Lock()  # Hydra composes one config at a time
 
 
 def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
@@ -63,7 +79,8 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
     from memmlp.evaluation.predictions import predict_clip
 
     torch.set_num_threads(1)  # leaves the other threads to training processes
-    experiment = build_run_experiment(run)
+    with _compose_lock:
+        experiment = build_run_experiment(run)
     if experiment.motion.find_digest() is None:
         raise InputError(f"run {run.id}: its data is not prepared here; prepare it with memmlp eval {run.id}")
     opened = OpenedRun(run, experiment, load_run_data(run, experiment))

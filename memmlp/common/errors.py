@@ -51,6 +51,11 @@ class TrainingDiverged(RuntimeError):
     clips. The exit code is 1."""
 
 
+class RunStopped(Exception):
+    """Somebody asked for the end of a run's work; its checkpoint is written. The message is one line; the
+    exit code is 1."""
+
+
 class LeaseLost(RuntimeError):
     """Another process took over this process' folder, because this process was frozen for too long. This
     process writes nothing more to the folder. The message is one line; the exit code is 1."""

@@ -122,6 +122,7 @@ class PageHandler(BaseHTTPRequestHandler):
 
     server: PageServer
     timeout = MAX_SEND_WAIT
+    max_body = MAX_BODY
     body: bytes
 
     def handle_one_request(self) -> None:
@@ -139,8 +140,8 @@ class PageHandler(BaseHTTPRequestHandler):
             return self._refuse(403, "access denied; open the address that the command printed")
         if chunked or not re.fullmatch(r"[0-9]+", length):
             return self._refuse(411, "Content-Length: must be a number of bytes")
-        if len(length) > 9 or int(length) > MAX_BODY:
-            return self._refuse(413, f"Content-Length: must be at most {MAX_BODY}")
+        if len(length) > 9 or int(length) > self.max_body:
+            return self._refuse(413, f"Content-Length: must be at most {self.max_body}")
         self.body = self.rfile.read(int(length))
         self.server.set_waiting(self.connection, math.inf)
         return True

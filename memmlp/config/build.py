@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -25,7 +25,7 @@ from memmlp.common.components import (
 from memmlp.common.errors import InputError
 from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import flatten, format_value
-from memmlp.common.text_formats import escape_interpolations
+from memmlp.common.text_formats import escape_interpolations, make_override
 from memmlp.config import plugins
 from memmlp.config.build_request import build_request, read_source_weights
 from memmlp.config.check import check
@@ -351,6 +351,37 @@ def _list_differences(config: Mapping[str, Any]) -> Iterator[str]:
             continue
         if key in own and own[key] != usual.get(key):
             yield f"{key}={format_value(own[key])}"
+
+
+def list_overrides(config: Mapping[str, Any]) -> list[str]:
+    """Return the overrides with which `memmlp train` composes a recorded config of a network again, except
+    loggers and other keys without an effect on results. Raises InputError if there are none."""
+    own = flatten({key: value for key, value in config.items() if key not in NOT_REPEATED})
+    plugins = [f"plugins={format_value(config['plugins'])}"] if config.get("plugins") else []
+    words = [*plugins, f"data={config['data']['name']}", f"profile={config['profile']['sizes']}"]
+    options = {slot: find_option(config, slot) for slot in SLOTS if slot in config}
+    for slots in (["model"], [slot for slot in options if slot != "model"]):  # a model sets other slots
+        default = _compose_plain(words)
+        changed = [slot for slot in slots if options[slot] != find_option(default, slot)]
+        words += [f"{slot}={options[slot] or 'null'}" for slot in changed]
+    for _ in range(3):  # a value may follow from another one
+        usual = flatten(_compose_plain(words))
+        words += [_make_repeated(key, value) for key, value in own.items() if usual.get(key) != value]
+    before, after = select_training_config(config), select_training_config(_compose_plain(words))
+    if differing := [key for key in before | after if before.get(key) != after.get(key)]:
+        raise InputError(f"{differing[0]}: overrides cannot set this value of the run")
+    return words
+
+
+NOT_REPEATED = ("loggers", "force", "save_predictions", "plugins", "imported_weights")
+
+
+def _make_repeated(key: str, value: Any) -> str:
+    return make_override(key, value) if isinstance(value, str) else f"{key}={format_value(value)}"
+
+
+def _compose_plain(words: Sequence[str]) -> dict[str, Any]:
+    return cast(dict[str, Any], OmegaConf.to_container(compose_config(words), resolve=True))
 
 
 def _is_shipped(slot: str, option: str) -> bool:

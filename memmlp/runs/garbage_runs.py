@@ -1,15 +1,17 @@
-"""Finds and deletes unneeded runs: failed runs, runs with older component versions, and orphans."""
+"""Finds unneeded runs, and deletes runs. Failed runs, runs with older component versions and orphans are
+unneeded."""
 
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.common.lease import is_alive
 from memmlp.runs.environment import collect_prerequisite_versions
 from memmlp.runs.identity import NETWORK, list_outdated
-from memmlp.runs.lookup import describe_kind, list_runs, read_notes
+from memmlp.runs.lookup import describe_kind, list_runs, log_action, read_notes
 from memmlp.runs.run import Run
 
 REASONS = ("failed", "old", "orphaned")
@@ -51,6 +53,24 @@ def delete(garbage_run: GarbageRun) -> bool:
     return True
 
 
+def list_dependents(outputs: Path, run: Run) -> list[str]:
+    """Return a line for each run that was trained from this run, and for each sweep or search with it."""
+    needing = [one.id for one in list_runs(outputs) if one.manifest.get("prerequisite") == run.id]
+    plans = [path.parent.name for path in _list_plans(outputs) if run.id in _read_planned_ids(path)]
+    lines = [f"run {name} was trained from it" for name in needing]
+    return lines + [f"sweep {name} contains it" for name in plans]
+
+
+def delete_run(outputs: Path, run: Run, by: str = "command line") -> None:
+    """Delete a run's folder, and log it in the outputs folder. Raises InputError if the run is in use."""
+    with run.lock(wait=False) as lease:
+        if not lease:
+            raise InputError(f"run {run.id}: must not be in use; stop it first: memmlp runs stop {run.id}")
+        run.reset()
+        shutil.rmtree(run.folder)
+    log_action(outputs, "delete", run.id, by)
+
+
 def _list_prerequisites(runs: Iterable[Run]) -> set[str | None]:
     return {run.manifest.get("prerequisite") for run in runs}
 
@@ -72,7 +92,7 @@ def _find_orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     used = _list_prerequisites(runs) | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
     unused = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
-    empty = [run for run in runs if not run.manifest and not run.damage]
+    empty = [run for run in runs if not (run.manifest or run.damage or run.is_stop_requested)]
     reasons = {run_id: f"no run uses this {describe_kind(kinds[run_id])}" for run_id in unused}
     return reasons | {run.id: "an empty folder" for run in empty}
 

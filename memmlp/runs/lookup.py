@@ -1,16 +1,17 @@
-"""Finds and describes runs in an outputs folder, and edits their tags and notes, which do not affect ids."""
+"""Finds and describes runs in an outputs folder, and edits their tags, notes and names, which do not affect
+ids."""
 
 import json
 import os
 import re
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import find_packaged_folder, write_json
+from memmlp.common.files import find_packaged_folder, now, write_json
 from memmlp.runs import records
 from memmlp.runs.identity import ID, NETWORK
 from memmlp.runs.run import Run
@@ -107,15 +108,17 @@ def warn_if_hardly_trained(frames: float) -> str:
 
 
 TAG = re.compile(r"[\w.+/:-]{1,64}")
-MAX_LENGTH = 10_000  # characters of a note
+MAX_LENGTH, MAX_NAME = 10_000, 200  # characters of a note, and of a custom name
 
 
 @dataclass(frozen=True)
 class Notes:
-    """A run's sorted tags and its note, which may be empty."""
+    """A run's sorted tags, its note and custom name, which may be empty, and whether lists leave it out."""
 
     tags: tuple[str, ...] = ()
     note: str = ""
+    name: str = ""
+    archived: bool = False
 
 
 def get_notes_path(run: Run) -> Path:
@@ -126,13 +129,14 @@ def get_notes_path(run: Run) -> Path:
 def read_notes(run: Run) -> Notes:
     """Return a run's tags and note; both are empty if the file is missing or damaged."""
     content = records.read(get_notes_path(run), records.Notes)
-    return Notes(tuple(sorted(set(content.get("tags", ())))), content.get("note", ""))
+    tags = tuple(sorted(set(content.get("tags", ()))))
+    return Notes(tags, content.get("note", ""), content.get("name", ""), content.get("archived", False))
 
 
 def add_tags(run: Run, tags: Iterable[str]) -> Notes:
     """Add tags to a run. Raises InputError for an invalid tag."""
     notes = read_notes(run)
-    return _write_notes(run, Notes(tuple(sorted({*notes.tags, *map(_check_tag, tags)})), notes.note))
+    return _write_notes(run, replace(notes, tags=tuple(sorted({*notes.tags, *map(_check_tag, tags)}))))
 
 
 def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
@@ -141,14 +145,14 @@ def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
     if missing := sorted(removed - set(notes.tags)):
         existing = ", ".join(notes.tags) or "none"
         raise InputError(f"tag '{missing[0]}': run {run.id} does not have this tag; its tags: {existing}")
-    return _write_notes(run, Notes(tuple(tag for tag in notes.tags if tag not in removed), notes.note))
+    return _write_notes(run, replace(notes, tags=tuple(tag for tag in notes.tags if tag not in removed)))
 
 
 def set_note(run: Run, note: str) -> Notes:
     """Replace a run's note; an empty note removes it. Raises InputError if the note is too long."""
     if len(note) > MAX_LENGTH:
         raise InputError(f"note: must have at most {MAX_LENGTH} characters, but has {len(note)}")
-    return _write_notes(run, Notes(read_notes(run).tags, note.strip()))
+    return _write_notes(run, replace(read_notes(run), note=note.strip()))
 
 
 def _check_tag(tag: str) -> str:
@@ -158,8 +162,52 @@ def _check_tag(tag: str) -> str:
 
 
 def _write_notes(run: Run, notes: Notes) -> Notes:
-    write_json(get_notes_path(run), {"tags": list(notes.tags), "note": notes.note})
+    fields = {key: value for key, value in asdict(notes).items() if value or key in ("tags", "note")}
+    write_json(get_notes_path(run), fields)
     return notes
+
+
+ACTIONS = ("stop", "retry", "archive", "restore", "name", "note", "tags")
+"""The changes of a run that the command line and the page make (`change_run`)."""
+
+
+def change_run(run: Run, action: str, value: str = "", by: str = "command line") -> None:
+    """Change a run, and log the change in its folder. Raises InputError for an invalid value.
+
+    Args:
+        run: the run; it may be in progress.
+        action: one of ACTIONS.
+        value: the name, the note, or all tags separated by blanks; empty for other actions.
+        by: who asked for the change, for the log.
+    """
+    match action:
+        case "stop" if run.complete and not run.failure:
+            raise InputError(f"run {run.id}: must be unfinished, but it is done")
+        case "stop":
+            run.request_stop()
+        case "retry":
+            run.retry()
+        case "archive" | "restore":
+            _write_notes(run, replace(read_notes(run), archived=action == "archive"))
+        case "name":
+            if len(value) > MAX_NAME or not value.isprintable():
+                raise InputError(f"name: must have at most {MAX_NAME} printable characters")
+            _write_notes(run, replace(read_notes(run), name=value.strip()))
+        case "note":
+            set_note(run, value)
+        case "tags":
+            tags = tuple(sorted({_check_tag(tag) for tag in value.split()}))
+            _write_notes(run, replace(read_notes(run), tags=tags))
+        case _:
+            raise InputError(f"action={action}: must be one of {', '.join(ACTIONS)}")
+    log_action(run.folder, action, value, by)
+
+
+def log_action(folder: Path, action: str, value: str, by: str) -> None:
+    """Append a line about a change to the file actions.jsonl in a folder."""
+    line = json.dumps({"time": now(), "action": action, "value": value, "by": by})
+    with open(folder / "actions.jsonl", "a", encoding="utf-8") as file:
+        file.write(f"{line}\n")
 
 
 # The package ships networks and a clip in its folder `models`. A shipped network is a finished run without

@@ -46,7 +46,7 @@ def build_record(run: Run) -> dict[str, Any]:
     facts = {name: manifest.get(name) for name in ("kind", "started", "prerequisite", "user")}
     digest = str(manifest.get("data") or "")
     facts |= {"data": flat.get("data.name") or digest[:SHORT], "data_digest": digest}
-    facts |= {"id": run.id, "name": get_run_name(manifest, flat), "status": run.status}
+    facts |= {"id": run.id, "name": notes.name or get_run_name(manifest, flat), "status": run.status}
     facts |= {"tag": notes.tags, "note": notes.note}
     return {**flat, **slots, **short, **results, **facts}
 

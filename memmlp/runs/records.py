@@ -81,7 +81,7 @@ Manifest = _record(
 )  # fmt: skip
 Marker = _record(id=str, finished=Time, artifacts=dict[Name, str])
 Failure = _record(reason=str, when=Time, details=str)
-Notes = _record(tags=list[str], note=str)
+Notes = _record(tags=list[str], note=str, name=str, archived=bool)
 
 # config.yaml: the keys of its groups that are read without the components
 Group = dict[str, Any] | None

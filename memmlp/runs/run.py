@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, RunStopped
 from memmlp.common.files import atomic_write, file_digest, now, sync_folder, write_json
 from memmlp.common.lease import Lease, Lock, check_owner
 from memmlp.common.overrides import flatten
@@ -43,7 +43,19 @@ from memmlp.runs.metrics_log import LogRecord, MetricsLog
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
 """The status of a run while a process works on a stage, by stage."""
 
-STATUSES = (*STAGE_WORDS.values(), "done", "trained", "lost", "failed", "damaged", "stopped", "new")
+STOPPED = "stopped on request"
+
+STATUSES = (
+    *STAGE_WORDS.values(),
+    "done",
+    "trained",
+    "lost",
+    "failed",
+    "damaged",
+    "stopped",
+    "interrupted",
+    "new",
+)
 """The statuses of runs (`Run.state`)."""
 
 
@@ -66,6 +78,7 @@ class Run:
         "metrics.jsonl",
         "poses.png",
         "FAILED",
+        "STOP",
         "code.patch",
         "config.yaml",
         "manifest.json",
@@ -85,6 +98,7 @@ class Run:
         self.evaluations = self.folder / "evaluations"
         self.deployments = self.folder / "deployments"
         self.marker = self.folder / "DONE"
+        self.stop_path = self.folder / "STOP"
         self._lock, self._log = Lock(self.folder), MetricsLog(self.metrics_path)
 
     @classmethod
@@ -208,10 +222,13 @@ class Run:
     def state(self, complete: bool) -> str:
         """Return the state of the run, given whether the caller considers it complete: done, running (a
         process works on it), lost (its process died), failed, damaged (a record cannot be read), trained (a
-        requested evaluation or deployment is missing), stopped, new."""
+        requested evaluation or deployment is missing), stopped (on request), interrupted, new."""
         if complete and not self.damage:
             return "done"
-        if (held := self._lock.is_held) is not None:
+        held = self._lock.is_held
+        if self.is_stop_requested and not held and not self.failure:
+            return "stopped"
+        if held is not None:
             return "running" if held else "lost"
         if self.failure:
             return "failed"
@@ -219,7 +236,7 @@ class Run:
             return "damaged"
         if self.done:
             return "trained"
-        return "stopped" if self.manifest_path.exists() else "new"
+        return "interrupted" if self.manifest_path.exists() else "new"
 
     @property
     def failure(self) -> str | None:
@@ -246,8 +263,12 @@ class Run:
 
     @property
     def fault(self) -> str | None:
-        """The reason why the run failed, or else its damaged record; None without either."""
-        return self.failure or next(iter(self.damage), None)
+        """The reason why the run failed, or else its damaged record or a request to stop; otherwise None."""
+        return self.failure or next(iter(self.damage), self._stop_fault)
+
+    @property
+    def _stop_fault(self) -> str | None:
+        return STOPPED if self.is_stop_requested and not self.complete else None
 
     def check_records(self) -> None:
         """Raise InputError if a record of the run cannot be read."""
@@ -260,7 +281,33 @@ class Run:
         failure = {"reason": " ".join(reason.split()), "when": now(), "details": details}
         write_json(self.folder / "FAILED", failure)
 
+    @property
+    def is_stop_requested(self) -> bool:
+        """Whether somebody asked for the end of the run's work."""
+        return self.stop_path.exists()
+
+    def request_stop(self) -> None:
+        """Ask for the end of the run's work, from any process: its worker writes a checkpoint at its next
+        step and stops. No worker continues the run before `retry`."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(self.stop_path, {"when": now()})
+
+    def check_not_stopped(self) -> None:
+        """Raise RunStopped if somebody asked for the end of the run's work."""
+        if self.is_stop_requested:
+            raise RunStopped(self.stop_message)
+
+    @property
+    def stop_message(self) -> str:
+        """The line that says how to continue a stopped run."""
+        return f"run {self.id}: {STOPPED}; continue it with: memmlp runs retry {self.id}"
+
     def retry(self) -> None:
+        """Remove a request to stop and the record of the failure, so that workers continue the run."""
+        self.stop_path.unlink(missing_ok=True)
+        self.forget_failure()
+
+    def forget_failure(self) -> None:
         """Remove the record of the failure, and stop counting the attempts that led to it."""
         if self.failure:
             self.reset_deaths()
@@ -300,7 +347,7 @@ class Run:
 
     def attempt(self, stage: str) -> None:
         """Record that this process begins to work on a stage of the run."""
-        self.retry()
+        self.forget_failure()
         attempt = {
             "started": now(),
             "pid": os.getpid(),

@@ -20,11 +20,11 @@ from memmlp.sweep.plan import Plan, RunTask
 
 COLOURS = {
     "done": "green", "running": "cyan", "failed": "red", "damaged": "red", "blocked": "red", "lost": "yellow",
-    "trained": "yellow",
+    "stopped": "yellow", "trained": "yellow",
 }  # fmt: skip
 STATE_NAMES = {
     "new": "waiting", "trained": "trained, unfinished",
-    "stopped": "waiting, started", "lost": "lost, to be taken over",
+    "interrupted": "waiting, started", "lost": "lost, to be taken over",
 }  # fmt: skip
 FAULTS = ("failed", "damaged")  # states with a reason
 VARIANT_WIDTH = 20  # the minimum width of the variants' column, unless all labels are shorter

@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_disk_error
+from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged, is_disk_error
 from memmlp.common.files import read_json, write_json
 from memmlp.common.lease import ChangeTimer, current_process, is_alive
 from memmlp.runs.run import Run
@@ -81,7 +81,8 @@ def try_task(plan: Plan, task: RunTask, perform: Perform) -> bool:
         if not mine:
             return False
         try:
-            if not plan.is_complete(task) and not run.failure:  # another process may have ended it
+            ended = run.failure or run.is_stop_requested  # meanwhile, by another process
+            if not ended and not plan.is_complete(task):
                 _finish_run(plan, task, run, perform)
         except LeaseLost as lost:
             print(f"memmlp: {lost}", file=sys.stderr, flush=True)
@@ -96,6 +97,8 @@ def _finish_run(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
         perform(plan, task)
     except Cancelled:
         pass
+    except RunStopped:
+        run.reset_deaths()
     except KeyboardInterrupt:
         run.reset_deaths()  # a scheduler may interrupt a run any number of times
         raise

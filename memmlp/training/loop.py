@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common import distributed
-from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.errors import InputError, RunStopped, TrainingDiverged
 from memmlp.common.progress import ProgressCounter, announce, label_progress, notify, show_progress
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
@@ -86,7 +86,8 @@ def train(
     checkpoint stays in the run's folder. The module is left with the final weights, which may be an average
     over steps, or the best ones on validation. The manifest records the number of steps and the compute.
     `on_validation` is called after each validation. Raises TrainingDiverged if the loss is NaN or infinite,
-    and InputError if several processes would not give the same result as one process."""
+    RunStopped after a checkpoint if somebody asked for it, and
+    InputError if several processes would not give the same result as one process."""
     check_processes(task, settings, description)
     settings = plan_steps(task, settings, run, description)
     optimiser = settings.build(task.parameter_groups())
@@ -106,15 +107,25 @@ def train(
             validation = record(task, settings, average, run, step + 1, result, count) if first else {}
             if validation:
                 best.update(step + 1, validation, average)
-            if (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
+            stop = step + 1 < settings.steps and must_stop(run, settings, step + 1)
+            if stop or (step + 1) % settings.checkpoint_every == 0 or step + 1 == settings.steps:
                 save(task, optimiser, average, best, run, step + 1, time.monotonic() - started)
             if validation and on_validation:
                 on_validation(step + 1, validation)
+            if stop:
+                raise RunStopped(run.stop_message)
     if distributed.is_first():
         run.record_seconds("train", time.monotonic() - started)
         run.write_manifest({"best_step": best.step or None})
     average.write_into_module()
     best.write_into_module()
+
+
+def must_stop(run: Run, settings: Optim, step: int) -> bool:
+    """Return in all processes whether somebody asked for the run's end. Several processes look less often."""
+    if distributed.world_size() > 1 and step % settings.log_every:
+        return False
+    return distributed.broadcast(distributed.is_first() and run.is_stop_requested)
 
 
 def plan_steps(task: TrainingTask, settings: Optim, run: Run, description: str) -> Optim:

@@ -160,6 +160,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: PreparedMotion) 
     run."""
     new_stages = []
     run.request_stages(experiment.stage_ids)
+    run.check_not_stopped()
     if missing := list_missing_modes(experiment, run):
         if any(run.has(experiment.evaluations[mode]) for mode in missing):
             announce("evaluation: the code of custom metrics has changed, so they are measured again")
@@ -193,6 +194,7 @@ def find_or_train(
         if run.done:
             return run
         with record_outcome(experiment, run):
+            run.check_not_stopped()
             begin_run(experiment, run, identity, dict(identity.config), before)
             run.write_manifest({"partial": describe_missing_data(experiment.config, data)})
             announce(f"{training.description} (run {run.id})")
@@ -233,6 +235,7 @@ def train_run(
     on_validation: ValidationCallback | None = None,
 ) -> None:
     """Train a run's network from the weights of the run `before`, and mark the run as done."""
+    run.check_not_stopped()
     announce(f"{experiment.training.description} (run {run.id})")
     begin_run(experiment, run, experiment.identity(data.digest), experiment.config, before)
     facts = {"body": data.manifest.body, "validation_clips": len(data.manifest.part("val"))}

@@ -1,5 +1,6 @@
 """`memmlp runs` on folders made by hand."""
 
+import json
 import re
 from pathlib import Path
 
@@ -54,7 +55,7 @@ def test_show(memmlp: Memmlp, outputs: Path):
         assert word in ran.out
     assert "changed since" not in ran.out
     assert "training from step 0" in ran.out
-    assert "stopped" in memmlp("runs", "show", C).out
+    assert "interrupted" in memmlp("runs", "show", C).out
     (outputs / "runs" / A / "results.json").write_text("{}")
     Run(outputs / "runs" / A).fail("the loss is infinite")
     said = memmlp("runs", "show", A).out
@@ -135,3 +136,22 @@ def test_export_and_import(memmlp: Memmlp, outputs: Path):
     assert one_line(memmlp("runs", "import", "run.zip", "--sha256", "0" * 64), "SHA-256")
     assert one_line(memmlp("runs", "import", "none.zip"), "no such file")
     assert one_line(memmlp("runs", "export", C), C)
+
+
+def test_stop_archive_rename_and_delete(memmlp: Memmlp, outputs: Path):
+    assert memmlp("runs", "stop", "c").out == f"{C}: stopped\n"
+    assert memmlp("runs", "retry", "c").out == f"{C}: interrupted\n"
+    assert one_line(memmlp("runs", "stop", "a"), "must be unfinished")
+    assert memmlp("runs", "rename", "a", "My best").code == 0
+    assert memmlp("runs", "archive", "b").code == 0
+    said = memmlp("runs", "list").out
+    assert "My best" in said
+    assert B[:8] not in said
+    assert B[:8] in memmlp("runs", "list", "--all").out
+    Run.from_id(outputs, C).write_manifest({"prerequisite": B})
+    ran = memmlp("runs", "delete", "b")
+    assert f"run {C} was trained from it" in ran.out
+    assert (outputs / "runs" / B).exists()
+    assert memmlp("runs", "delete", "b", "--yes").code == 0
+    assert not (outputs / "runs" / B).exists()
+    assert json.loads((outputs / "actions.jsonl").read_text())["value"] == B

@@ -187,7 +187,7 @@ def test_an_interrupted_sweep_ends_its_workers(tmp_path: Path):
     assert left == 130, said
     assert "interrupted" in said
     assert "Traceback" not in said
-    until(lambda: run.status in ("stopped", "lost"), "its worker ends")
+    until(lambda: run.status in ("interrupted", "lost"), "its worker ends")
 
 
 BAD_INPUT: list[tuple[list[str], str]] = [

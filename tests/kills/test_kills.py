@@ -113,7 +113,7 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
     Run.from_id(stormy, "0" * 16).write_manifest({"attempts": [again]})
     assert sorted(chaos.compare(calm, stormy)) == [
         f"run {'0' * 16}: trained again after it was finished", f"run {'a' * 16} is missing",
-        f"run {'b' * 16}: other weights", f"run {'c' * 16}: stopped, not done",
+        f"run {'b' * 16}: other weights", f"run {'c' * 16}: interrupted, not done",
         f"run {'d' * 16}: is still held", f"run {'e' * 16}: artifact model.safetensors is missing or changed",
         f"run {'e' * 16}: other weights", f"run {'f' * 16} should not be",
     ]  # fmt: skip

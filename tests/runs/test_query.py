@@ -97,7 +97,7 @@ def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):
     add_tags(run, ["good"])
     for text in (
         "memory=gru", "memory.layers=[2]", "stream.MPJPE=6.5", "stream.position.MPJPE=7", "tag=good",
-        "status=stopped", f"id={run.id}", "stream.rotation.MPJPE<7",
+        "status=interrupted", f"id={run.id}", "stream.rotation.MPJPE<7",
     ):  # fmt: skip
         assert parse_query(text).match_records([build_record(run)]) == [True], text
 

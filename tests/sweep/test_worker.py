@@ -1,6 +1,7 @@
 """Workers do each run exactly once, whoever dies; the plans here need no training."""
 
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from processes import PATIENCE, started, until
 
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.common.lease import ChangeTimer
+from memmlp.runs.lookup import change_run
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
@@ -80,6 +82,31 @@ def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):
     assert now.read_states()[ONE.id] == "done"
 
 
+def test_a_stopped_run_is_left_until_it_is_retried(tmp_path: Path):
+    path, plan_run = saved(tmp_path, ALONE, CODES), Run.from_id(tmp_path, ALONE.id)
+
+    def perform(plan: Plan, task: RunTask) -> None:
+        if task == ALONE:
+            plan_run.begin("memmlp", {}, data="d", prerequisite=None)
+            change_run(plan_run, "stop")
+        plan.get_run(task).check_not_stopped()
+        finish(plan, task)
+
+    work_on_plan(path, perform)
+    plan = Plan.load(path)
+    assert (plan.read_states()[ALONE.id], plan_run.failure, plan_run.fault) == (
+        "stopped", None, "stopped on request"
+    )  # fmt: skip
+    work_on_plan(path, Mock(side_effect=AssertionError))
+    change_run(plan_run, "retry")
+    work_on_plan(path, finish)
+    assert plan.read_states()[ALONE.id] == "done"
+    log = (plan_run.folder / "actions.jsonl").read_text().splitlines()
+    assert [json.loads(line)["action"] for line in log] == ["stop", "retry"]
+    with pytest.raises(InputError, match="must be unfinished"):
+        change_run(plan_run, "stop")
+
+
 def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
     path = saved(tmp_path, CODES, ONE, ALONE)
     work_on_plan(path, Mock(side_effect=InputError("no")))
@@ -98,7 +125,7 @@ def test_a_cancelled_run_is_left_as_it_is(tmp_path: Path):
 
     path = saved(tmp_path, ALONE)
     work_on_plan(path, perform)
-    assert Plan.load(path).get_run(ALONE).status == "stopped"
+    assert Plan.load(path).get_run(ALONE).status == "interrupted"
     assert Plan.load(path).list_remaining() == []
 
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 from tiny_tasks import OPTIM, TASKS, motion_task, weights
 
-from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.errors import InputError, RunStopped, TrainingDiverged
+from memmlp.networks import checkpoint
 from memmlp.runs.run import Run
 from memmlp.training.loop import train
 from memmlp.training.train_network import compute_perplexity
@@ -126,3 +127,27 @@ def test_a_resumed_training_keeps_the_same_weights(tmp_path):
 def test_a_branch_that_is_not_validated_is_refused(tmp_path):
     with pytest.raises(InputError, match="best_by: 'position MPJPE' is not validated"):
         train(task_with_errors({}), replace(BEST, best_by="position"), Run(tmp_path), 0, "it")
+
+
+def test_a_stopped_run_keeps_its_step_and_ends_in_the_same_weights(tmp_path):
+    """It is asked to stop during step 5 of 8, two steps after the last checkpoint."""
+    whole, stopped = Run(tmp_path / ("a" * 16)), Run(tmp_path / ("b" * 16))
+    for run in (whole, stopped):
+        run.folder.mkdir()
+    train(TASKS["streams"](optim=SHORT), SHORT, whole, 0, "whole")
+    task = TASKS["streams"](optim=SHORT)
+    step = task.step
+
+    def asked(number: int):
+        if number == 4:
+            stopped.request_stop()
+        return step(number)
+
+    task.step = asked
+    with pytest.raises(RunStopped, match=f"memmlp runs retry {stopped.id}"):
+        train(task, SHORT, stopped, 0, "stopped")
+    assert checkpoint.read(stopped.checkpoint)[1]["step"] == 5
+    stopped.retry()
+    train(TASKS["streams"](optim=SHORT), SHORT, stopped, 0, "again")
+    expected, got = weights(whole), weights(stopped)
+    assert all(torch.equal(expected[name], got[name]) for name in expected)

@@ -1,10 +1,22 @@
-"""`memmlp runs`: list, show, compare, tag, clean up and move run folders."""
+"""`memmlp runs`: list, show, compare, tag, stop, clean up and move run folders."""
 
 import click
 
 from memmlp.cli.runs.listing import list_runs
 from memmlp.cli.runs.show import diff, show
-from memmlp.cli.runs.storage import export, gc, import_, note, tag
+from memmlp.cli.runs.storage import (
+    archive,
+    delete,
+    export,
+    gc,
+    import_,
+    note,
+    rename,
+    restore,
+    retry,
+    stop,
+    tag,
+)
 
 
 @click.group("runs")
@@ -12,5 +24,7 @@ def runs() -> None:
     """List, show, compare, tag, clean up and move runs."""
 
 
-for command in (list_runs, show, diff, tag, note, gc, export, import_):
+for command in (
+    list_runs, show, diff, tag, note, rename, stop, retry, archive, restore, delete, gc, export, import_,
+):  # fmt: skip
     runs.add_command(command)

@@ -57,7 +57,8 @@ NAME_WIDTH = 31  # minimum width of the column of names, in characters
 @click.option("--columns", help="Comma-separated keys to show.  [default: differing config keys]")
 @outputs_option
 def list_runs(every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path) -> None:
-    """List the runs, newest first. Without --all, finished VQ-VAEs and network parts are hidden.
+    """List the runs, newest first. Without --all, finished VQ-VAEs, network parts and archived
+    runs are hidden.
 
     The columns are name, data, differing config keys, the rotation branch's MPJPE in both modes, Jitter, and
     latency per frame. KEY is a config key (`memory`, `optim.lr`), a result (`stream.MPJPE`,
@@ -68,7 +69,7 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     from memmlp.runs.query import parse_query
 
     query = parse_query(where) if where else None
-    runs = lookup.list_runs(outputs)
+    runs = [run for run in lookup.list_runs(outputs) if every or query or not lookup.read_notes(run).archived]
     if not runs:
         hint = "memmlp demo creates one; --outputs FOLDER or MEMMLP_OUTPUTS selects another folder"
         click.echo(f"no runs in {outputs.absolute() / 'runs'}: {hint}")

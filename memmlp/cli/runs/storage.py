@@ -1,4 +1,4 @@
-"""`memmlp runs tag`, `note`, `gc`, `export` and `import`."""
+"""`memmlp runs tag`, `note`, `stop`, `retry`, `archive`, `delete`, `gc`, `export` and `import`."""
 
 from pathlib import Path
 
@@ -41,6 +41,62 @@ def note(run: str, text: str | None, outputs: Path) -> None:
     found = find_run(outputs, run)
     notes = read_notes(found) if text is None else set_note(found, text)
     click.echo(f"{found.id}: {notes.note or 'no note'}")
+
+
+def _make_command(action: str, text: str) -> click.Command:
+    @click.command(action, help=text)
+    @click.argument("runs", nargs=-1, required=True)
+    @outputs_option
+    def command(runs: tuple[str, ...], outputs: Path) -> None:
+        from memmlp.runs.lookup import change_run, find_run
+
+        for run in [find_run(outputs, one) for one in runs]:
+            change_run(run, action)
+            click.echo(f"{run.id}: {run.status}")
+
+    return command
+
+
+stop = _make_command(
+    "stop",
+    "Stop runs that train, or that a sweep will train.\n\nThe worker writes a checkpoint at its next step. A "
+    "sweep does not continue a stopped run before `memmlp runs retry RUN`.",
+)
+retry = _make_command("retry", "Let workers continue stopped runs, and repeat failed ones.")
+archive = _make_command("archive", "Leave runs out of lists and the page. Their files stay.")
+restore = _make_command("restore", "Show archived runs in lists and the page again.")
+
+
+@click.command("rename")
+@click.argument("run")
+@click.argument("name")
+@outputs_option
+def rename(run: str, name: str, outputs: Path) -> None:
+    """Show a run with another name.
+
+    Its id stays. An empty NAME restores the usual name.
+    """
+    from memmlp.runs.lookup import change_run, find_run
+
+    change_run(find_run(outputs, run), "name", name)
+
+
+@click.command("delete")
+@click.argument("runs", nargs=-1, required=True)
+@click.option("--yes", is_flag=True, help="Delete. Without --yes, only print what depends on the runs.")
+@outputs_option
+def delete(runs: tuple[str, ...], yes: bool, outputs: Path) -> None:
+    """Delete runs, or print what depends on them."""
+    from memmlp.runs.garbage_runs import delete_run, list_dependents
+    from memmlp.runs.lookup import find_run
+
+    for run in [find_run(outputs, one) for one in runs]:
+        lines = list_dependents(outputs, run)
+        click.echo(f"{run.id}: {'; '.join(lines) or 'nothing depends on it'}")
+        if yes:
+            delete_run(outputs, run)
+    if not yes:
+        click.echo("delete with --yes")
 
 
 @click.command("gc")

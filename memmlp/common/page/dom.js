@@ -37,8 +37,25 @@ export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short
   const cell = (content, i, head) => (content instanceof HTMLTableCellElement ? content
     : h(head || !i ? 'th' : 'td', { scope: head ? 'col' : i ? null : 'row', class: i && n ? 'n' : null }, content));
   const line = (contents, head) => h('tr', {}, contents.map((content, i) => cell(content, i, head)));
-  return h('div', { class: scroll }, h('table', { class: `grid ${kind}` }, caption && h('caption', {}, caption),
-    heads && h('thead', {}, line(heads, true)), h('tbody', {}, rows.map(row => line(row)))));
+  const grid = h('table', { class: `grid ${kind}` }, caption && h('caption', {}, caption),
+    heads && h('thead', {}, line(heads, true)), h('tbody', {}, rows.map(row => line(row))));
+  const save = h('button', { type: 'button', class: 'csv', title: 'Save this table as CSV', onclick: () => download('table.csv', toCsv(grid)) }, 'CSV');
+  return h('div', { class: 'saved' }, h('div', { class: scroll }, grid), heads ? save : null);
+}
+
+// A table as CSV: the cells' data-csv, or else their text. A text that a spreadsheet would run as a formula begins with '.
+export function toCsv(grid) {
+  const text = cell => cell.dataset.csv ?? [...cell.childNodes].map(node => node.textContent).join(' ').replace(/\s+/g, ' ').trim().replace(/^\u2212(?=\d)/, '-');
+  const guard = one => (/^[=+@\t\r']|^-(?!\d)/.test(one) ? `'${one}` : one);
+  const field = one => (/[",\n\r]/.test(one) ? `"${one.replaceAll('"', '""')}"` : one);
+  const cells = row => [...row.cells].filter(cell => !cell.matches('.pick'));
+  return [...grid.rows].map(row => cells(row).map(cell => field(guard(text(cell)))).join(',')).join('\r\n') + '\r\n';
+}
+
+export function download(name, text) {
+  const href = URL.createObjectURL(new Blob([text], { type: 'text/csv' }));
+  h('a', { href, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(href), 10000);
 }
 
 export function empty(title, ...children) {

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.report.ui.runs import read_curves, thin_out
+from memmlp.report.ui.runs import SECONDS, read_curves, thin_out
 from memmlp.report.ui.server import Answers, make_single_file
 from memmlp.report.ui.sweeps import KnownSweep
 from memmlp.runs.run import Run
@@ -18,7 +18,7 @@ MAX_CLIPS = 60  # maximum number of clips of a run
 MAX_REPLAYS = 4  # maximum number of replays
 REPLAY_SECONDS = 4
 ERROR = "stream.rotation.MPJPE"  # metric that selects a sweep's best run
-CURVES = ("train loss", "val rotation ", "val position MPJPE", "val loss")  # prefixes of curve names
+CURVES = (SECONDS, "train loss", "val rotation ", "val position MPJPE", "val loss")  # prefixes of curve names
 LONG_FACTS = ("source", "attempts", "prerequisite_runs")  # prefixes of manifest keys that are left out
 
 
@@ -101,7 +101,7 @@ def _replay_best_runs(
     replays: dict[str, Any] = {}
     for ids in sweeps:
         runs = [answers.index.runs[run_id] for run_id in ids if run_id in answers.index.runs]
-        measured = [run for run in runs if ERROR in run["metrics"]]
+        measured = [run for run in runs if isinstance(run["metrics"].get(ERROR), float)]
         if not measured or len(replays) >= MAX_REPLAYS:
             continue
         page = pages[f"run/{min(measured, key=lambda run: run['metrics'][ERROR])['id']}"]

@@ -9,13 +9,22 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import make_json_safe
+from memmlp.common.files import make_json_safe, to_number
+from memmlp.common.lease import Lock
 from memmlp.common.overrides import flatten
+from memmlp.common.processes import MIN_CORE_FRACTION
+from memmlp.report.tables.measured_run import CORE_FRACTION_KEYS
 from memmlp.runs import records
 from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import ConfiguredEvaluations, add_solver_names
-from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE
-from memmlp.runs.lookup import get_run_name, read_notes
+from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, find_training_settings
+from memmlp.runs.lookup import (
+    count_training_frames,
+    get_run_name,
+    is_trained,
+    read_notes,
+    warn_if_hardly_trained,
+)
 from memmlp.runs.run import Run, name_latency
 
 HIDDEN_GROUPS = ("paths", "loggers", "force", "hydra", "save_predictions")
@@ -30,7 +39,10 @@ COSTS = {
 }  # fmt: skip
 """Listed costs of a deployment, with units. Lower values are better."""
 
-FILES = ("config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "results.json", "notes.json")
+FILES = (
+    "config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "STOP", "results.json", "notes.json",
+)  # fmt: skip
+STAGES_AFTER = ("evaluate", "export")  # the recorded times of the stages after training
 RECENT_ENTRIES = 5  # number of training entries for the estimate of a run's speed
 
 
@@ -70,7 +82,9 @@ def read_facts(folder: Path) -> dict[str, Any]:
     listed, seconds = select_listed_values(config), manifest.get("seconds")
     return {
         "id": run.id,
-        "name": get_run_name(manifest, listed),
+        "name": notes.name or get_run_name(manifest, listed),
+        "archived": notes.archived,
+        "stopping": run.is_stop_requested,
         "kind": manifest.get("kind", ""),
         "done": run.done,
         "started": manifest.get("started", ""),
@@ -82,6 +96,10 @@ def read_facts(folder: Path) -> dict[str, Any]:
         "device": str(manifest.get("gpu") or manifest.get("device") or ""),
         "prerequisite": manifest.get("prerequisite") or "",
         "steps": manifest.get("steps") or run.total_steps or None,
+        "batch": _read_batch(str(manifest.get("kind")), config),
+        "since": (manifest.get("attempts") or [{}])[-1].get("started", ""),
+        "after": sum(map((seconds or {}).get, STAGES_AFTER, (0.0, 0.0))) if run.done else None,
+        "marks": _list_marks(run),
         "recent": _list_recent_entries(run),
         "config": listed,
         "metrics": _read_metrics(run, {key: config[key] for key in USE_GROUPS if key in config}),
@@ -90,6 +108,31 @@ def read_facts(folder: Path) -> dict[str, Any]:
         "note": notes.note,
         "damage": [line.removeprefix(f"{folder}/") for line in run.damage],
     }  # fmt: skip
+
+
+def list_preparations(outputs: Path) -> list[dict[str, Any]]:
+    """Return the data sets that a process prepares now: name, and bytes that are written so far."""
+    caches = [folder for folder in outputs.glob("cache/*/") if Lock(folder).is_held]
+    return [{"name": one.name, "bytes": sum(f.stat().st_size for f in one.glob("*"))} for one in caches]
+
+
+def _list_marks(run: Run) -> dict[str, str]:
+    """Return what a reader must know about a run's numbers: a text for "errors", and one for "latency"."""
+    if not is_trained(run) or run.damage:
+        return {}
+    marks = {"errors": warn_if_hardly_trained(count_training_frames(run))}
+    record = select_deployed_measurements(run.deployment_as_configured.record)
+    shares = [record[key] for key in CORE_FRACTION_KEYS.values() if key in record]
+    if shares and min(shares) < MIN_CORE_FRACTION:
+        marks["latency"] = f"timed on a busy machine: a core was free {min(shares):.0%} of the time"
+    return {key: text for key, text in marks.items() if text}
+
+
+def _read_batch(kind: str, config: Mapping[str, Any]) -> int | None:
+    try:
+        return int(find_training_settings(kind, config)["batch"])
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def read_config(run: Run) -> dict[str, Any]:
@@ -119,8 +162,8 @@ def _list_recent_entries(run: Run) -> list[list[Any]]:
     ]
 
 
-def _read_metrics(run: Run, config: Mapping[str, Any]) -> dict[str, float]:
-    """Return metrics and costs by dotted name, such as "stream.rotation.MPJPE"."""
+def _read_metrics(run: Run, config: Mapping[str, Any]) -> dict[str, float | str]:
+    """Return metrics and costs by dotted name, such as "stream.rotation.MPJPE"; a text for NaN."""
     found: dict[str, Any] = {}
     try:
         evaluations = ConfiguredEvaluations(run.evaluations, config)
@@ -131,8 +174,11 @@ def _read_metrics(run: Run, config: Mapping[str, Any]) -> dict[str, float]:
     name, record = name_latency(deployed, config), select_deployed_measurements(deployed.record)
     found |= {f"{name}.{key}": record[key] for key in COSTS if key in record}
     found |= flatten(records.read(run.results_path, records.Tree), "vqvae.")
+    numbers = {key: to_number(value) for key, value in found.items()}
     return {
-        key: value for key, value in found.items() if isinstance(value, int | float) and math.isfinite(value)
+        key: value if math.isfinite(value) else str(value)
+        for key, value in numbers.items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
     }
 
 

@@ -1,6 +1,7 @@
 """The server's answers about runs: rows of the run table, a run's page, and curves."""
 
 import math
+import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
@@ -12,25 +13,29 @@ from memmlp.common.files import make_json_safe
 from memmlp.common.overrides import flatten
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.table_text import find_direction, find_unit
-from memmlp.report.ui.run_index import COSTS, RunIndex, read_config
+from memmlp.report.ui.run_index import COSTS, RunIndex, list_preparations, read_config
 from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import add_solver_names, read_report
 from memmlp.runs.identity import NETWORK, NEUTRAL, is_data_path
-from memmlp.runs.lookup import count_training_frames, is_trained, warn_if_hardly_trained
+from memmlp.runs.lookup import is_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
 VIEWABLE_FILES = (
     "config.yaml", "manifest.json", "metrics.jsonl", "code.patch", "FAILED", "notes.json", "poses.png",
+    "actions.jsonl",
 )  # fmt: skip
 """Run files that the page may show without changes."""
 
 MAX_FILES = 200
+SECONDS = "seconds"  # the curve of working time
+MAX_GAP = 3600.0  # seconds between two entries; a longer gap is an interruption
 MAX_POINTS = 400  # approximate maximum number of points of a curve
 
 ROW_FACTS = (
     "id", "name", "kind", "status", "started", "finished", "seconds", "device", "tags", "note", "failure",
-    "damage", "data", "data_name", "code", "steps", "recent", "signature",
+    "damage", "data", "data_name", "code", "steps", "recent", "signature", "batch", "since", "marks",
+    "prerequisite", "archived", "stopping",
 )  # fmt: skip
 """The facts of a run in its table row."""
 
@@ -44,7 +49,10 @@ def list_rows(index: RunIndex, places: Places) -> dict[str, Any]:
     keys = find_differing_keys(runs.values())
     metrics = list(dict.fromkeys(metric for run in runs.values() for metric in run["metrics"]))
     minor = [name for name in NEUTRAL if name != "data"]
+    later = [run["after"] for run in runs.values() if run["after"] and run["kind"] == NETWORK]
     return {
+        "preparing": list_preparations(index.outputs),
+        "after": statistics.median(later) if later else None,  # seconds after training
         "keys": keys,
         "minor": [key for key in keys if any(key == name or key.startswith(f"{name}.") for name in minor)],
         "paths": list(filter(is_data_path, keys)),
@@ -109,7 +117,7 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         places: the sweeps and searches by run id.
     """
     facts, run = index.runs[run_id], Run.from_id(index.outputs, run_id)
-    config, is_sound = _read_flat_config(run), facts["kind"] == NETWORK and not facts["damage"]
+    config = _read_flat_config(run)
     clips = read_clips(run)
     return {
         **facts,
@@ -127,7 +135,6 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         "latency": _read_latency(run),
         "changed": run.verify() if run.done else [],
         "outdated": list_outdated_modes(run),
-        "remark": warn_if_hardly_trained(count_training_frames(run)) if is_sound else "",
         "files": _list_files(run.folder),
     }
 
@@ -204,7 +211,8 @@ def _list_files(folder: Path) -> list[dict[str, Any]]:
 
 
 def read_curves(run: Run) -> dict[str, Any]:
-    """Return a run's curves by name, such as "train loss": [steps, values]; None for NaN or infinity."""
+    """Return a run's curves by name, such as "train loss": [steps, values], and "seconds" of work at these
+    steps; None for NaN or infinity."""
     try:
         stat = run.metrics_path.stat()
         return _read_log(run.folder, stat.st_mtime_ns, stat.st_size)
@@ -215,7 +223,11 @@ def read_curves(run: Run) -> dict[str, Any]:
 @lru_cache(1024)
 def _read_log(folder: Path, *stamp: int) -> dict[str, Any]:
     series: dict[str, dict[int, float]] = defaultdict(dict)
+    seconds, before = 0.0, None
     for entry in Run(folder).metrics():
+        gap = entry.time - before if before is not None else 0.0
+        seconds, before = seconds + (gap if 0 < gap < MAX_GAP else 0.0), entry.time
+        series[SECONDS][entry.step] = round(seconds, 1)
         for name, value in entry.values.items():
             series[f"{entry.phase} {name}"][entry.step] = value
     return {name: thin_out(points) for name, points in series.items()}
@@ -237,5 +249,8 @@ def _make_sort_value(value: float | None) -> float:
     return value if value is not None and math.isfinite(value) else math.inf
 
 
-def _round_value(value: float | None, digits: int) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(f"{value:.{digits}g}")
+def _round_value(value: float | str | None, digits: int) -> float | str | None:
+    """Round a number; a text is returned as it is, and None for NaN and infinity."""
+    if value is None or isinstance(value, str):
+        return value
+    return float(f"{value:.{digits}g}") if math.isfinite(value) else None

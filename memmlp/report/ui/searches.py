@@ -140,6 +140,8 @@ def _describe_trial(trial: FrozenTrial) -> dict[str, Any]:
         "state": trial.state.name.lower(),
         "values": [value if math.isfinite(value) else None for value in values],
         "params": trial.params,
+        "began": trial.datetime_start.timestamp() if trial.datetime_start else None,
+        "ended": trial.datetime_complete.timestamp() if trial.datetime_complete else None,
         "runs": list(trial.user_attrs.get("runs", ())),
         "reason": get_reason(trial),
     }

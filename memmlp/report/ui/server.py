@@ -1,19 +1,25 @@
-"""The page's server. It sends files and JSON answers; no request can change a run."""
+"""The page's server. It sends files and JSON answers, and makes the changes of runs that the page asks for.
+
+A change needs the page's own token, which only the page can read, and the page's origin. Each is logged in
+the run's folder. There are no changes if the outputs folder is read-only."""
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
+import os
 import re
+import secrets
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import digest, make_json_safe
+from memmlp.common.files import digest, make_json_safe, read_json, write_json
 from memmlp.common.page_server import (
     HOST,
     TEXT,
@@ -23,16 +29,29 @@ from memmlp.common.page_server import (
     find_content_type,
     read_page_file,
 )
+from memmlp.common.schema import check_type
 from memmlp.report.ui import runs
 from memmlp.report.ui.replay import Predict, Replays, describe_body
-from memmlp.report.ui.run_index import RunIndex
+from memmlp.report.ui.run_index import RunIndex, list_preparations
 from memmlp.report.ui.searches import Searches
 from memmlp.report.ui.sweeps import Sweeps
+from memmlp.runs.garbage_runs import delete_run, list_dependents
 from memmlp.runs.identity import ID
+from memmlp.runs.lookup import change_run
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
+VIEWS = "views.json"  # the saved views in the outputs folder
 MAX_CURVES = 60  # maximum number of runs in an answer with curves
+
+
+class Change(TypedDict, total=False):
+    """A change that the page asks for (`Answers.change`)."""
+
+    action: str
+    value: str
+    name: str
+    runs: list[str]
 
 
 class Answers:
@@ -42,10 +61,17 @@ class Answers:
         outputs: the folder of runs and caches.
         predict: computes a run's prediction for a test clip.
         pause: minimum time between two scans of the folder, seconds.
+        make_command: returns the command that makes a run again.
     """
 
-    def __init__(self, outputs: Path, predict: Predict, pause: float = 1.0):
-        self.outputs, self.pause = outputs, pause
+    def __init__(
+        self,
+        outputs: Path,
+        predict: Predict,
+        pause: float = 1.0,
+        make_command: Callable[[Run], str] = lambda run: "",
+    ):
+        self.outputs, self.pause, self.make_command = outputs, pause, make_command
         self.index = RunIndex(outputs)
         self.sweeps, self.searches = Sweeps(self.index), Searches(outputs)
         self.replays = Replays(outputs, predict)
@@ -60,7 +86,8 @@ class Answers:
         with self.lock:
             started = time.monotonic()
             if started >= self.next_look:
-                stamps = self.index.refresh(), self.sweeps.refresh(), self.searches.make_stamp()
+                preparing = list_preparations(self.outputs)
+                stamps = self.index.refresh(), self.sweeps.refresh(), self.searches.make_stamp(), preparing
                 self.state = digest(stamps)[:16]
                 ended = time.monotonic()
                 self.next_look = ended + max(self.pause, 9 * (ended - started))
@@ -91,13 +118,20 @@ class Answers:
                 if query.get("state") == state:
                     return {"state": state}
                 rows = runs.list_rows(self.index, self.list_places())
-                return {**rows, "state": state, "outputs": str(self.outputs.absolute())}
+                outputs = str(self.outputs.absolute())
+                return {**rows, "state": state, "outputs": outputs, "writable": self.is_writable}
             case "curves", False:
                 run_ids = [one for one in ID.findall(query.get("runs", "")) if one in self.index.runs]
                 found_runs = [Run.from_id(self.outputs, run_id) for run_id in run_ids[:MAX_CURVES]]
                 return {"curves": {run.id: runs.read_curves(run) for run in found_runs}}
             case "body", False:
                 return describe_body()
+            case "views", False:
+                return {"views": read_json(self.outputs / VIEWS)}
+            case "dependents", True if ID.fullmatch(name):
+                return {"lines": list_dependents(self.outputs, Run.from_id(self.outputs, name))}
+            case "command", True if name in self.index.runs:
+                return {"command": self.make_command(Run.from_id(self.outputs, name))}
             case "sweeps", _:
                 return self.sweeps.describe(name) if name else self.sweeps.list_rows()
             case "searches", _:
@@ -107,6 +141,42 @@ class Answers:
                     return self._get_replay(name, query)
                 return runs.describe_run(self.index, name, self.sweeps.find_control(name), self.list_places())
         raise KeyError(path)
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether runs can be changed."""
+        return os.access(self.outputs, os.W_OK)
+
+    def change(self, request: Mapping[str, Any]) -> None:
+        """Change runs or saved views. Raises InputError for a bad request.
+
+        Args:
+            request: `action`, `value`, and the `runs` by id. The actions are those of `change_run`, "delete",
+                and "view", which saves `value`, an address, by its `name`; an empty value deletes the view.
+        """
+        try:
+            check_type(request, Change)
+        except ValueError as error:
+            raise InputError(f"change: {error}") from None
+        action, value = request.get("action", ""), request.get("value", "")
+        self.refresh()
+        if not self.is_writable:
+            raise InputError(f"{self.outputs}: must be writable; it is read-only")
+        if action == "view" and not request.get("name", "").strip():
+            raise InputError("name: must not be empty")
+        if action == "view":
+            views = read_json(self.outputs / VIEWS) | {request["name"]: value}
+            write_json(self.outputs / VIEWS, {name: address for name, address in views.items() if address})
+        planned = {task.id for known in self.sweeps.known.values() for task in known.plan.tasks}
+        for run_id in request.get("runs", ()) if action != "view" else ():
+            if run_id not in self.index.runs and not (action == "stop" and run_id in planned):
+                raise InputError(f"run {run_id}: not found")
+            run = Run.from_id(self.outputs, run_id)
+            if action == "delete":
+                delete_run(self.outputs, run, "page")
+            else:
+                change_run(run, action, value, "page")
+        self.next_look = 0.0
 
     def describe_missing(self, path: str) -> str:
         """Return an error message for an unknown path, with the searched folder."""
@@ -133,19 +203,39 @@ class RunsHandler(PageHandler):
 
     server: RunsServer
     protocol_version = "HTTP/1.1"  # keeps connections open
+    max_body = 50_000
 
     def answer(self, path: str, query: Mapping[str, str]) -> None:
         """Send a page file, an answer, or a run file."""
         kind, _, name = path.partition("/")
         if path in ("", *FILES):
-            file = path or "index.html"
-            self.send(200, find_content_type(file), read_file(file))
+            file, content = path or "index.html", read_file(path or "index.html")
+            if file == "index.html":
+                content = content.replace(b"TOKEN", self.server.change_token.encode())
+            self.send(200, find_content_type(file), content)
         elif kind == "api":
             self._send_answer(name, query)
         elif kind == "files":
             self._send_run_file(*name.partition("/")[::2])
         else:
             self._send_json(404, {"error": f"{path}: not found"})
+
+    def do_POST(self) -> None:
+        """Change runs, as the page asks."""
+        server, given = self.server, self.headers.get("X-Memmlp-Token", "")
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            is_own = secrets.compare_digest(given.encode(), server.change_token.encode())
+            if not (is_own and server.access.allows_change(self.path, self.headers, server.server_port)):
+                return self._send_json(403, {"error": "only the page itself may change runs; load it again"})
+            if self.path != "/api/change":
+                return self._send_json(404, {"error": f"{self.path}: not found"})
+            try:
+                server.answers.change(json.loads(self.body))
+            except (InputError, OSError) as error:
+                return self._send_json(400, {"error": str(error)})
+            except (ValueError, RecursionError):
+                return self._send_json(400, {"error": "must be JSON"})
+            self._send_json(200, {})
 
     def _send_answer(self, path: str, query: Mapping[str, str]) -> None:
         try:
@@ -184,7 +274,7 @@ class RunsServer(PageServer):
     """
 
     def __init__(self, answers: Answers, port: int, host: str = HOST, token: str | None = None):
-        self.answers = answers
+        self.answers, self.change_token = answers, secrets.token_urlsafe(24)
         policy = build_security_policy(read_file("index.html").decode())
         self.headers = {"Content-Security-Policy": f"{policy}; frame-ancestors 'none'"}
         super().__init__(RunsHandler, port, host, token)
@@ -199,7 +289,7 @@ SCRIPTS = {"plot/d3.min.js": UI_PACKAGE, "plot/plot.umd.min.js": UI_PACKAGE}
 MODULES = {
     **dict.fromkeys(
         ("main.js", "store.js", "filter.js", "format.js", "charts.js", "runs.js", "run.js", "sweeps.js",
-         "searches.js", "curves.js", "replay.js"),
+         "searches.js", "curves.js", "replay.js", "now.js", "state.js", "actions.js", "groups.js"),
         UI_PACKAGE,
     ),
     **dict.fromkeys(

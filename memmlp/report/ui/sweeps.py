@@ -234,6 +234,7 @@ class Sweeps:
         described = describe_rounds(rounds, sweep) if rounds else None
         branches = {variant.branch for variant in sweep.variants}
         return {
+            "command": command,
             "metric": metric,
             "branch": branches.pop() if len(branches) == 1 else "",
             "table": {

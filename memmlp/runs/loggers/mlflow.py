@@ -31,7 +31,8 @@ ENVIRONMENT = {
 }
 EXPERIMENT = "memmlp"
 STATUS = {
-    "running": "RUNNING", "done": "FINISHED", "failed": "FAILED", "killed": "KILLED", "stopped": "KILLED",
+    "running": "RUNNING", "done": "FINISHED", "failed": "FAILED", "killed": "KILLED",
+    "stopped": "KILLED", "interrupted": "KILLED",
 }  # fmt: skip
 PARAM_LENGTH, TAG_LENGTH, PARAMS, METRICS = 6000, 5000, 100, 1000  # MLflow's limits
 

@@ -135,7 +135,7 @@ class Director:
             )
             return True
         for task in one.tasks:
-            if failure := self.plan.get_run(task).failure:
+            if failure := self.plan.get_run(task).fault:
                 self.study.fail(one.trial, failure)
                 return True
         return one.seed_count == 1 and 0 < step < runs[0].total_steps and self.study.prune(one.trial)

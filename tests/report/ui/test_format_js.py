@@ -35,3 +35,11 @@ def test_an_error_below_a_tenth_has_two_digits_as_its_difference_has():
     ]  # fmt: skip
     assert js("f.effectDigits({mean: 4e-4, holm: .3, level: .05, value: 0.0034})") == 4
     assert js("f.metricNumber('Jitter', 0.034)") == "0.034"
+
+
+def test_numbers_of_names_and_columns_are_rounded_to_what_differs():
+    names = "[...f.shortNames(['lr=0.00991234 · seed 0', 'lr=0.000787654 · seed 0', 'v=1.0']).values()]"
+    assert js(names) == ["lr=0.00991 · seed 0", "lr=0.000788 · seed 0", "v=1.0"]
+    assert js("[...f.shortNames(['lr=0.12341', 'lr=0.12342']).values()]") == ["lr=0.12341", "lr=0.12342"]
+    assert js("[0.123456, 2, 'a'].map(f.columnWords([0.123456, 0.2]))") == ["0.123", "2", "a"]
+    assert js("[0.123456, 0.123499].map(f.columnWords([0.123456, 0.123499]))") == ["0.12346", "0.1235"]

@@ -182,3 +182,56 @@ def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     )
     go(browser, file.as_uri(), f"run/{best.id}", "document.documentElement.dataset.replayed?.endsWith(' 3')")
     go(browser, file.as_uri(), "sweep/mine", "document.querySelectorAll('.plot svg').length >= 2")
+
+
+def test_daily_work_groups_baseline_csv_and_changes(browser: Browser, tmp_path: Path):
+    make_outputs(tmp_path)
+    new = started_run(tmp_path)
+    gru, none = (run_of(tmp_path, variant, 0) for variant in ("gru", "none"))
+    rows = "[...document.querySelectorAll('.runs tbody tr')].map(r => r.textContent)"
+    with RunsServer(Answers(tmp_path, predict, 0.05), 0) as running:
+        go(
+            browser,
+            running.url,
+            f"runs?by=variant&base={none.id}",
+            "document.querySelectorAll('.group').length == 3",
+        )
+        (group,) = (row for row in browser.value(rows) if "mine: gru" in row)
+        assert "3 runs" in group
+        assert re.search(r"5\.\d\d ± 0\.0\d\N{MINUS SIGN}1\.3", group)
+        browser.value(
+            "URL.createObjectURL = blob => { blob.text().then(t => { window.saved = t; }); return '#'; }; "
+            "[...document.querySelectorAll('.tools button')].find(b => b.textContent == 'CSV').click()"
+        )
+        browser.wait("window.saved")
+        head, *lines = browser.value("window.saved").splitlines()
+        assert "stream.rotation.MPJPE" in head
+        assert len(lines) == 7
+        go(browser, running.url, f"run/{new.id}", "document.querySelector('.picked button')")
+        press = "[...document.querySelectorAll('.picked button')].find(b => b.textContent == '{}').click()"
+        browser.value(press.format("Stop"))
+        browser.wait("document.querySelector('h1 + .state')?.textContent == 'stopped'")
+        assert new.is_stop_requested
+        browser.value(press.format("Retry"))
+        browser.wait("document.querySelector('h1 + .state')?.textContent == 'interrupted'")
+        browser.value(press.format("Name"))
+        browser.value("document.querySelector('dialog input').value = 'Mine <b>'")
+        browser.click("dialog .primary")
+        browser.wait("document.querySelector('h1').textContent == 'Mine <b>'")
+        browser.value(press.format("Delete"))
+        browser.wait("document.querySelector('dialog')?.textContent.includes('Nothing depends')")
+        browser.click("dialog .primary")
+        browser.wait("location.hash == '#/runs'")
+    assert not new.folder.exists()
+    assert gru.folder.exists()
+
+
+def test_what_runs_and_what_failed_is_on_top(browser: Browser, server: RunsServer, home: Path):
+    with Run.from_id(home, "abcdef0123456789").lock():
+        go(browser, server.url, "runs", "document.querySelector('.now progress')")
+        text = browser.value("document.querySelector('.now').textContent")
+        assert " failed" in text
+        assert "training, step" in text
+    browser.size(390, 844)
+    go(browser, server.url, "runs?by=same", "document.querySelector('.group')")
+    assert browser.value("document.documentElement.scrollWidth") <= 390

@@ -4,10 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
+from fake_runs import write_evaluation
 from report.ui.conftest import run_of, started_run
 
+from memmlp.common.lease import Lock
 from memmlp.report.ui import run_index
-from memmlp.report.ui.run_index import RunIndex, read_facts
+from memmlp.report.ui.run_index import RunIndex, list_preparations, read_facts
 
 
 def test_facts_of_a_finished_run(outputs: Path):
@@ -60,7 +62,7 @@ def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.Mo
     run = started_run(outputs)
     second = index.refresh()
     assert (second != first, parsed[6:]) == (True, [run.id])
-    assert index.runs[run.id]["status"] == "stopped"
+    assert index.runs[run.id]["status"] == "interrupted"
     run.log(600, {"loss": 1.0})
     assert index.refresh() != second
     assert (parsed[6:], index.runs[run.id]["recent"][-1][0]) == ([run.id] * 2, 600)
@@ -86,3 +88,30 @@ def test_a_run_is_not_done_while_it_is_evaluated_or_once_its_deployment_failed(o
     assert (run.status, status()) == ("failed", "failed")
     run.retry()
     assert status() == "done"
+
+
+def test_numbers_are_marked_where_a_reader_must_know_more(outputs: Path):
+    run = run_of(outputs)
+    path = run.deployment("fp32-0").latency
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"core_share": 0.5}))
+    report = next(run.evaluations.glob("stream*"))
+    content = json.loads(report.read_text())
+    content["mean"]["rotation"]["Jitter"] = "nan"
+    write_evaluation(report, content)
+    found = read_facts(run.folder)
+    assert found["marks"]["errors"].startswith("hardly trained")
+    assert found["marks"]["latency"] == "timed on a busy machine: a core was free 50% of the time"
+    assert found["metrics"]["stream.rotation.Jitter"] == "nan"
+    assert (found["after"], found["batch"]) == (20.0, 1)
+    assert read_facts(started_run(outputs).folder)["marks"] == {}
+
+
+def test_data_that_is_prepared_is_seen(tmp_path: Path):
+    cache = tmp_path / "cache" / "mocap"
+    cache.mkdir(parents=True)
+    (cache / "train.npy").write_bytes(b"123")
+    assert list_preparations(tmp_path) == []
+    with Lock(cache).hold():
+        (found,) = list_preparations(tmp_path)
+        assert found["name"] == "mocap"
+        assert found["bytes"] >= 3

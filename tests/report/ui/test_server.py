@@ -111,3 +111,66 @@ def test_the_page_s_files_and_their_policy(server: RunsServer, outputs: Path):
 ])  # fmt: skip
 def test_other_hosts_and_other_pages_get_nothing(server: RunsServer, headers: dict[str, str], code: int):
     assert get(server, "/api/runs", **headers).code == code
+
+
+def post(server: RunsServer, body: object, **headers: str) -> Answer:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
+    given = {"X-Memmlp-Token": server.change_token} | {
+        key.replace("_", "-"): one for key, one in headers.items()
+    }
+    connection.request("POST", "/api/change", json.dumps(body), given)
+    response = connection.getresponse()
+    answer = Answer(response.status, response.read(), response.headers)
+    connection.close()
+    return answer
+
+
+def test_the_page_changes_runs_and_every_change_is_logged(server: RunsServer, outputs: Path):
+    run, new = run_of(outputs), started_run(outputs)
+    assert f'content="{server.change_token}"'.encode() in get(server, "/").body
+    for change in (
+        {"action": "name", "value": "Best"}, {"action": "tags", "value": "b a"},
+        {"action": "note", "value": "x"},
+        {"action": "archive"},
+    ):  # fmt: skip
+        assert post(server, {**change, "runs": [run.id]}).json == {}
+    assert post(server, {"action": "stop", "runs": [new.id]}).code == 200
+    rows = {row["id"]: row for row in get(server, "/api/runs").json["rows"]}
+    shown = rows[run.id]
+    assert (shown["name"], shown["tags"], shown["note"], shown["archived"]) == ("Best", ["a", "b"], "x", True)
+    assert rows[new.id]["status"] == "stopped"
+    logged = [json.loads(line) for line in (run.folder / "actions.jsonl").read_text().splitlines()]
+    assert [(one["action"], one["by"]) for one in logged] == [
+        (action, "page") for action in ("name", "tags", "note", "archive")
+    ]
+    assert get(server, f"/api/dependents/{run.id}").json == {"lines": ["sweep mine contains it"]}
+    assert post(server, {"action": "delete", "runs": [new.id]}).code == 200
+    assert not new.folder.exists()
+    view = {"action": "view", "name": "Mine", "value": "filter=gru"}
+    assert post(server, view).code == 200
+    assert get(server, "/api/views").json == {"views": {"Mine": "filter=gru"}}
+    assert post(server, {**view, "value": ""}).code == 200
+    assert get(server, "/api/views").json == {"views": {}}
+
+
+def test_a_change_needs_the_token_the_origin_and_a_writable_folder(
+    server: RunsServer, outputs: Path, monkeypatch
+):
+    run = run_of(outputs)
+    tag = {"action": "tags", "value": "good", "runs": [run.id]}
+    for headers in (
+        {"X_Memmlp_Token": "other"}, {"Origin": "http://evil.example"}, {"Sec_Fetch_Site": "cross-site"},
+    ):  # fmt: skip
+        assert post(server, tag, **headers).code == 403
+    for bad in (
+        [], {"action": 3}, {"action": "explode", "runs": [run.id]}, {**tag, "value": "<b>"},
+        {**tag, "runs": ["0" * 16]}, {**tag, "runs": ["../x"]}, {"action": "view", "name": " "},
+        {"action": "stop", "runs": [run.id]},
+    ):  # fmt: skip
+        answer = post(server, bad)
+        assert (answer.code, list(answer.json)) == (400, ["error"])
+    monkeypatch.setattr("memmlp.report.ui.server.os.access", lambda path, mode: False)
+    answer = post(server, tag)
+    assert (answer.code, "read-only" in answer.json["error"]) == (400, True)
+    assert not (run.folder / "notes.json").exists()
+    assert not (run.folder / "actions.jsonl").exists()

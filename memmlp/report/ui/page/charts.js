@@ -42,7 +42,7 @@ const tip = (data, options) => Plot.tip(data, Plot.pointer({ fill: 'var(--card)'
 
 // Curves by group with the band of each group's runs.
 // series: [{ run, group, steps, values }]
-export function curves(series, { label, log = false, smooth = 0, colours }) {
+export function curves(series, { label, log = false, smooth = 0, colours, axis = 'step' }) {
   const kept = series.map(one => smoothed(one, smooth)).filter(one => one.steps.length);
   const groups = [...new Set(kept.map(one => one.group))];
   const bands = groups.flatMap(group => band(kept.filter(one => one.group === group), group));
@@ -53,14 +53,14 @@ export function curves(series, { label, log = false, smooth = 0, colours }) {
   const lines = points.filter(point => single.has(point.group));
   const tips = [...wide, ...lines.map(point => ({ ...point, mean: point.value }))];
   const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.42, 220), 400), {
-    x: { label: 'step', ticks: Math.min(width / 90, 8), tickFormat: 's' },
+    x: { label: axis, ticks: Math.min(width / 90, 8), tickFormat: axis === 'hours' ? '~g' : '~s' },
     y: { label, type: log ? 'log' : 'linear', grid: true, nice: true, ticks: 5, tickFormat: log ? undefined : '~g' },
     marks: [
       Plot.areaY(wide, { x: 'step', y1: 'low', y2: 'high', z: 'group', fill: point => colours.get(point.group), fillOpacity: 0.16 }),
       Plot.line(lines, { x: 'step', y: 'value', z: 'run', stroke: point => colours.get(point.group), strokeWidth: 1.8 }),
       Plot.line(wide, { x: 'step', y: 'mean', z: 'group', stroke: point => colours.get(point.group), strokeWidth: 2 }),
       Plot.ruleX(tips, Plot.pointerX({ x: 'step', stroke: 'var(--faint)', strokeOpacity: 0.5 })),
-      tip(tips, { x: 'step', y: 'mean', title: point => [point.group, `step ${point.step}`,
+      tip(tips, { x: 'step', y: 'mean', title: point => [point.group, `${axis} ${number(point.step)}`,
         point.low === undefined ? number(point.mean) : `${number(point.mean)}  (${number(point.low)} to ${number(point.high)}, ${point.count} runs)`].join('\n') }),
     ],
   }));
@@ -68,7 +68,7 @@ export function curves(series, { label, log = false, smooth = 0, colours }) {
     const mine = points.filter(point => point.group === group);
     return mine.length ? `${group} ends at ${number(mine.at(-1).value)}` : '';
   });
-  return figure(`${label} by step. ${last.filter(Boolean).join('; ')}.`, draw);
+  return figure(`${label} by ${axis}. ${last.filter(Boolean).join('; ')}.`, draw);
 }
 
 // A run without NaN values, blurred over a radius of some points.
@@ -135,13 +135,14 @@ export function frontier(points, { x, y }) {
 }
 
 // Points { x, y, text, best } in two measures; a line joins the best ones. open(point): called by a click.
-export function scatter(points, { x, y, open }) {
+export function scatter(points, { x, y, open, joined = true, log = false }) {
+  const isNumber = points.every(point => typeof point.x === 'number');
   const best = points.filter(point => point.best).sort((a, b) => a.x - b.x);
   const draw = width => {
     const plot = Plot.plot(base(width, 280, {
-      x: { label: x, grid: true, nice: true, ticks: Math.min(width / 90, 8), tickFormat: '~r' }, y: { label: y, grid: true, nice: true, ticks: 6 },
+      x: { label: x, grid: true, ...(isNumber ? { nice: true, ticks: Math.min(width / 90, 8), ...(log ? { type: 'log', tickFormat: '~g' } : { tickFormat: '~r' }) } : { type: 'point' }) }, y: { label: y, grid: true, nice: true, ticks: 6 },
       marks: [
-        Plot.line(best, { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.6, curve: 'step-after' }),
+        Plot.line(joined ? best : [], { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.6, curve: 'step-after' }),
         Plot.dot(points, { x: 'x', y: 'y', r: 4.5, fill: point => (point.best ? 'var(--series1)' : 'var(--series0)'), fillOpacity: 0.85 }),
         tip(points, { x: 'x', y: 'y', title: 'text' }),
       ],
@@ -150,6 +151,22 @@ export function scatter(points, { x, y, open }) {
     return plot;
   };
   return figure(`${y} by ${x}; the best are ${best.map(point => number(point.y)).join(', ')}.`, draw);
+}
+
+// When each trial ran: { number, began, ended, kind, text }, in seconds.
+export function spans(rows, { label }) {
+  const start = Math.min(...rows.map(row => row.began));
+  const [unit, size] = Math.max(...rows.map(row => row.ended)) - start < 7200 ? ['minutes', 60] : ['hours', 3600];
+  const at = time => (time - start) / size;
+  const colour = row => ({ done: 'var(--good)', failed: 'var(--bad)', running: 'var(--series0)' })[row.kind] ?? 'var(--faint)';
+  const draw = width => Plot.plot(base(width, Math.min(60 + 9 * rows.length, 480), {
+    x: { label: unit, grid: true, ticks: Math.min(width / 90, 8) }, y: { label: 'trial', reverse: true, nice: true, ticks: 6, tickFormat: '~r' },
+    marks: [
+      Plot.link(rows, { x1: row => at(row.began), x2: row => at(row.ended), y1: 'number', y2: 'number', stroke: colour, strokeWidth: 4, strokeLinecap: 'round' }),
+      tip(rows, { x: row => at(row.began), y: 'number', title: 'text' }),
+    ],
+  }));
+  return figure(`${label}: ${rows.map(row => row.text).join('; ')}`, draw);
 }
 
 // Errors over time; a click goes to a moment. The style property --now, from 0 to 1, places a line.

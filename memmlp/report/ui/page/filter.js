@@ -4,7 +4,7 @@ import { about } from './store.js';
 
 const CONDITION = /^([\w.\- ]*?[\w.\-])(<=|>=|!=|=|<|>)(.*)$/;
 const PLACES = ['sweep', 'variant', 'search', 'trial'];
-const FACTS = ['id', 'name', 'status', 'kind', 'device', 'note', 'started', 'code', 'data'];
+const FACTS = ['archived', 'id', 'name', 'status', 'kind', 'device', 'note', 'started', 'code', 'data'];
 
 // The tests of a filter's text, each a function of a run.
 export function parse(text) {

@@ -49,6 +49,20 @@ export function word(value) {
   return Array.isArray(value) ? value.map(word).join(', ') : String(value);
 }
 
+// A function that writes the values of a column with as few digits as keep different numbers apart, at least three.
+export function columnWords(values) {
+  const numbers = [...new Set(values.filter(value => typeof value === 'number' && Number.isFinite(value)))];
+  const digits = [3, 4, 5, 6, 8].find(count => new Set(numbers.map(value => value.toPrecision(count))).size === numbers.length) ?? 16;
+  return value => (typeof value === 'number' && !Number.isInteger(value) ? word(Number(value.toPrecision(digits))) : word(value));
+}
+
+// Names with their long numbers rounded to three digits, or to as many as keep different names apart.
+export function shortNames(names) {
+  const written = digits => new Map(names.map(name => [name, name.replace(/\d+\.\d{3,}(e[-+]?\d+)?/gi, text => String(Number(Number(text).toPrecision(digits))))]));
+  const apart = [3, 5, 8].map(written).find(found => new Set(found.values()).size === new Set(names).size);
+  return apart ?? new Map(names.map(name => [name, name]));
+}
+
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return DASH;
   const units = [[90, 's', 1, 0], [5400, 'min', 60, 0], [129600, 'h', 3600, 1], [Infinity, 'd', 86400, 0]]; // [below, unit, its seconds, digits]

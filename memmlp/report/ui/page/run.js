@@ -3,8 +3,11 @@
 import { h, replace, link, section, select, table } from './dom.js';
 import { address, ask, dataName, inFile, nameOf, place, remember, runs } from './store.js';
 import { ago, ARROWS, better, bytes, DASH, date, duration, effectDigits, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
+import { buttons } from './actions.js';
 import { curvePanel } from './curves.js';
-import { FINISHED, status, tags } from './runs.js';
+import { status } from './now.js';
+import { tags } from './runs.js';
+import { FINISHED } from './state.js';
 
 const METRICS = ['MPJPE', 'MPJRE', 'MPJVE', 'Jitter', 'Hand PE', 'Upper PE', 'Lower PE', 'Root PE', 'geodesic'];
 
@@ -33,18 +36,21 @@ export async function page(id) {
   return { title: nameOf(run), element, update, close: () => replay?.close() };
 }
 
+// After a change of a run: its page is read again; a deleted run has none.
+const after = deleted => { if (deleted) location.hash = address('runs'); else dispatchEvent(new Event('hashchange')); };
+
 function head(run) {
-  const places = run.places.map(at => [' / ', at.sweep ? [link(address('sweep', at.sweep), at.sweep), ` · ${at.variant}, seed ${at.seed}`] : [link(address('search', at.search), at.search), ` · trial ${at.trial}`]]);
+  const places = run.places.map(at => [' / ', at.sweep ? [link(address('sweep', at.sweep), at.sweep), ` · ${at.variant}, seed ${at.seed}`] : [link(address('search', at.search, { trial: at.trial }), at.search), ` · trial ${at.trial}`]]);
   return [
     h('p', { class: 'trail' }, link('#/runs', 'Runs'), places),
-    h('div', { class: 'bar' }, h('h1', {}, nameOf(run)), status(run), tags(run)),
+    h('div', { class: 'bar' }, h('h1', {}, nameOf(run)), status(runs.get(run.id) ?? run), tags(run), h('div', { class: 'picked' }, buttons([run.id], after))),
     run.note ? h('p', { class: 'remark' }, run.note) : null,
   ];
 }
 
 function warnings(run) {
   const lines = [
-    ['Failed', run.failure], ['Damaged', run.damage.length && `${run.damage.join('; ')}.`], ['Its network', run.remark && `${run.remark}.`],
+    ['Failed', run.failure], ['Damaged', run.damage.length && `${run.damage.join('; ')}.`], ['Its network', run.marks.errors && `${run.marks.errors}.`],
     ['Changed since it was made', run.changed.join(', ')],
     ['Measured by an earlier component version', run.outdated.length && `${run.outdated.join(', ')}. Measure it again with memmlp eval ${run.id}.`],
   ];
@@ -76,7 +82,7 @@ function results(run) {
     const before = other?.[`${column}.${metric}`];
     const part = run.partial[`${column}.${metric}`];
     const own = [metricNumber(metric, value), part ? h('small', { class: 'faint' }, ` (${part[0]} of ${part[1]} clips)`) : null];
-    if (value === undefined || typeof before !== 'number') return own;
+    if (typeof value !== 'number' || typeof before !== 'number') return own;
     const change = value - before;
     const verdict = better(metric) && (change < 0 === (better(metric) === 'lower') ? 'better' : 'worse');
     return [own, h('small', { class: verdict }, signed(change, effectDigits({ mean: change, value })))];

@@ -1,27 +1,21 @@
 // The table of runs: filter, sort, the columns in which they differ, tags and notes; and chosen runs with their curves.
 
-import { h, replace, link, section, empty, say } from './dom.js';
-import { about, address, nameOf, place, remember, runs } from './store.js';
+import { download, h, replace, link, section, select, empty, say, toCsv } from './dom.js';
+import { about, address, ask, inFile, nameOf, place, remember, runs } from './store.js';
 import { parse, matches } from './filter.js';
 import { curvePanel } from './curves.js';
-import { ago, bestOf, better, date, duration, DASH, metricNumber, metricWords, number, shortKeys, word } from './format.js';
+import { button, buttons, canChange, change, command, dialog } from './actions.js';
+import { scatter } from './charts.js';
+import { baseline, difference, groupCell, grouper, groupings as groupsOf } from './groups.js';
+import { now, status } from './now.js';
+import { FINISHED, state, STATES, STATE_WORDS } from './state.js';
+import { ago, bestOf, better, columnWords, date, duration, DASH, metricNumber, metricText, metricWords, number, shortKeys, word } from './format.js';
 
 const STEP = 150; // rows that are drawn at once
+const VIEW = ['filter', 'sort', 'by', 'cols', 'base', 'x', 'y']; // what a saved view keeps
 const KEYS = 6; // config columns that are shown by default
 const METRICS = ['stream.rotation.MPJPE', 'stream.rotation.MPJRE', 'stream.rotation.MPJVE', 'stream.rotation.Jitter', 'latency.median_ms'];
 const NARROW = matchMedia('(max-width: 640px)'); // errors come before keys on a narrow screen
-export const ACTIVE = ['training', 'evaluating', 'exporting'];
-export const FINISHED = ['done', 'trained'];
-const STATES = [...ACTIVE, ...FINISHED, 'failed', 'damaged', 'lost', 'stopped', 'new'];
-export const STATE_WORDS = { new: 'waiting' };
-const STATE_TITLES = { trained: 'Trained; an evaluation or export that was asked for is missing.' };
-
-// The class of a status: all work on a run looks the same.
-export const look = status => (ACTIVE.includes(status) ? 'running' : status);
-
-export function state(status, title = STATE_TITLES[status]) {
-  return h('span', { class: `state ${look(status)}`, title }, STATE_WORDS[status] ?? status);
-}
 
 // The keys in which these runs differ; of several that differ in the same way (memory and its sizes) the first.
 export function differing(list, keys) {
@@ -57,7 +51,7 @@ export async function page(name, route) {
   if (only && !only.length) throw new Error('None of these runs is here.');
   const panel = only && curvePanel(only, groupings(only.map(id => runs.get(id))));
   const chosen = new Set((place().query.get('sel') ?? '').split(',').filter(Boolean));
-  const ui = { drawn: STEP };
+  const ui = { drawn: STEP, open: new Set() };
   const counted = h('p', { class: 'count', role: 'status' });
   const dataSets = h('p', { class: 'best' });
   const table = h('table', { class: 'runs' });
@@ -69,29 +63,75 @@ export async function page(name, route) {
     oninput: () => { ui.drawn = STEP; set({ filter: filter.value }); },
   });
   const scroll = h('div', { class: 'scroll tall' }, table, more);
-  const nothing = h('div');
+  const [nothing, happening, tools, picked, plot] = Array.from({ length: 5 }, () => h('div'));
+  const remarks = h('p', { class: 'faint' });
+  picked.className = 'picked';
 
-  function draw() {
+  function draw(live = false) { // live: without touching what somebody uses
+    const inUse = part => live && part.contains(document.activeElement);
     const { query } = place();
-    const settings = { text: query.get('filter') ?? '', sort: query.get('sort') ?? '-started' };
+    const settings = { text: query.get('filter') ?? '', sort: query.get('sort') ?? '-started', group: query.get('by') ?? '' };
     if (filter.value !== settings.text) filter.value = settings.text;
     const tests = parse(settings.text);
-    ui.list = sorted([...runs.values()].filter(run => (!only || only.includes(run.id)) && matches(tests, run)), settings.sort);
+    const archived = settings.text.includes('archived');
+    ui.list = sorted([...runs.values()].filter(run => (only ? only.includes(run.id) : archived || !run.archived) && matches(tests, run)), settings.sort);
     ui.data = [...new Set(ui.list.filter(run => FINISHED.includes(run.status)).map(run => run.data))];
+    ui.groupOf = settings.group ? grouper(settings.group) : null;
+    ui.base = baseline(query.get('base'), ui.groupOf, ui.list);
     const networks = ui.list.filter(run => run.kind === 'memmlp'); // a VQ-VAE has few of their keys
     const metrics = !networks.length ? about.metrics.filter(one => one.startsWith('vqvae.')).slice(0, 5) : only ? about.metrics.filter(one => !one.includes('GT ')) : METRICS;
-    const measured = metrics.filter(one => ui.list.some(run => typeof run.metrics[one] === 'number'));
-    const groups = [differing(networks.length ? networks : ui.list, about.keys).slice(0, only ? undefined : KEYS), measured];
-    ui.columns = (NARROW.matches ? groups.reverse() : groups).flat();
+    const pinned = (query.get('cols') ?? '').split(',').filter(one => about.keys.includes(one) || about.metrics.includes(one));
+    const measured = metrics.filter(one => !pinned.includes(one) && ui.list.some(run => run.metrics[one] !== undefined && run.metrics[one] !== null));
+    const keys = differing(networks.length ? networks : ui.list, about.keys).slice(0, only ? undefined : KEYS).filter(one => !pinned.includes(one) && !(settings.group === 'same' && one === 'seed'));
+    ui.columns = [...pinned, ...(NARROW.matches ? [measured, keys] : [keys, measured]).flat()];
+    ui.words = new Map(ui.columns.map(name => [name, columnWords(ui.list.map(run => run.config[name]))]));
     head(settings.sort);
     body();
-    selection();
+    if (!inUse(picked)) selection();
+    if (!inUse(tools)) replace(tools, toolbar(query, pinned, settings.group));
+    scatterOf(query);
     const count = name => ui.list.filter(run => run.status === name).length;
     replace(counted, [`${number(ui.list.length)} of ${number(runs.size)} runs`, ...STATES.filter(count).map(name => `${number(count(name))} ${STATE_WORDS[name] ?? name}`)].join(', '));
     replace(dataSets, ui.data.length > 1 ? `On ${ui.data.length} data sets, whose errors are not comparable; filter by one: ${ui.data.slice(0, 5).map(data => `data=${data}`).join(', ')}` : null);
-    scroll.hidden = !ui.list.length;
+    replace(happening, now());
+    const marks = [...new Set(ui.list.slice(0, ui.drawn).flatMap(run => Object.values(run.marks)).map(text => text.replace(/ \(.*?\)|: a core.*/, '')))];
+    replace(remarks, marks.length ? `* ${marks.join('; ')}` : null);
+    scroll.hidden = tools.hidden = !ui.list.length;
     replace(nothing, ui.list.length ? null : runs.size ? empty('No run matches.', h('button', { type: 'button', onclick: () => set({ filter: '' }) }, 'Show all runs'))
-      : empty('There are no runs yet.', h('p', {}, 'They appear here as soon as one starts:'), h('pre', {}, 'memmlp demo\nmemmlp train data=synth profile=tiny'), h('p', { class: 'faint' }, `Searched in: ${about.outputs}/runs`)));
+      : empty('There are no runs yet.', h('p', {}, 'They appear here as soon as one starts:'), command('memmlp demo'), command('memmlp train data=synth profile=tiny'), h('p', { class: 'faint' }, `Searched in: ${about.outputs}/runs`)));
+  }
+
+  // Groups, columns, baseline, saved views and CSV.
+  function toolbar(query, pinned, group) {
+    const names = [...about.keys, ...about.metrics].filter(one => !pinned.includes(one)).map(one => [one, one]);
+    const pin = list => set({ cols: list.join(',') });
+    const here = new URLSearchParams([...query].filter(([key]) => VIEW.includes(key))).toString();
+    const view = Object.entries(ui.views ?? {}).find(([, text]) => text === here)?.[0] ?? '';
+    const openView = text => { remember({ ...Object.fromEntries(VIEW.map(key => [key, ''])), ...Object.fromEntries(new URLSearchParams(ui.views[text] ?? '')) }); draw(); };
+    const store = async (name, value) => { await change({ action: 'view', name, value }); await readViews(); };
+    return h('div', { class: 'tools' },
+      select('Group by', groupsOf(about.keys), group, by => set({ by })),
+      select('Pin a column', [['', 'choose'], ...names], '', one => one && pin([...pinned, one])),
+      select('Scatter', [['', 'off'], ...names.filter(([one]) => about.metrics.includes(one))], query.get('y') ?? '', y => set({ y })),
+      Object.keys(ui.views ?? {}).length ? select('View', [['', 'choose'], ...Object.keys(ui.views).map(one => [one, one])], view, openView) : null,
+      canChange() && !only ? h('div', { class: 'chips' }, button('Save view', () => dialog('Save view', { field: 'input', value: view, act: text => store(text, here || 'sort=-started') })),
+        view ? button('Delete view', () => dialog(`Delete the view ${view}?`, { word: 'Delete', act: () => store(view, '') })) : null) : null,
+      button('CSV', () => download('runs.csv', toCsv(whole())), 'All rows and shown columns'),
+      h('div', { class: 'chips' }, pinned.map(one => button(`${one} ×`, () => pin(pinned.filter(other => other !== one)), 'Unpin')), ui.base ? button(`Baseline: ${ui.base.name} ×`, () => set({ base: '' })) : null));
+  }
+
+  const whole = () => h('table', {}, table.tHead.cloneNode(true), h('tbody', {}, ui.list.map(run => line(run, {}))));
+
+  function scatterOf(query) {
+    const [x, y] = [query.get('x') || about.keys.find(key => key !== 'seed' && ui.list.some(run => typeof run.config[key] === 'number')) || about.metrics[0], query.get('y')];
+    if (!y || !about.metrics.includes(y)) { ui.plotted = ''; return replace(plot); }
+    const of = (run, name) => (name in run.config ? run.config[name] : run.metrics[name]);
+    const points = ui.list.map(run => ({ x: of(run, x), y: of(run, y), run, best: ui.base?.members.includes(run), text: `${nameOf(run)}\n${x} ${word(of(run, x))}\n${y} ${word(of(run, y))}` })).filter(point => typeof point.y === 'number' && (point.x ?? null) !== null);
+    const key = JSON.stringify([x, y, points.map(point => [point.x, point.y, point.best])]);
+    if (key === ui.plotted) return plot;
+    ui.plotted = key;
+    return replace(plot, section('Scatter', h('div', { class: 'tools' }, select('Horizontal', [...about.keys, ...about.metrics].map(one => [one, one]), x, value => set({ x: value }))),
+      points.length ? scatter(points, { x, y: metricText(y), joined: false, open: point => { location.hash = address('run', point.run.id); } }) : h('p', { class: 'faint' }, 'No run has both.')));
   }
 
   function head(sort) {
@@ -104,47 +144,64 @@ export async function page(name, route) {
     };
     const metric = name => {
       const { metric, where, unit } = metricWords(name);
-      return cell(name, [h('span', {}, metric), h('small', {}, [where, unit].filter(Boolean).join(', '))], { class: 'n', title: name });
+      return cell(name, [h('span', {}, metric), h('small', {}, [where, unit].filter(Boolean).join(', '))], { class: 'n', title: name, 'data-csv': name });
     };
-    const all = h('input', { type: 'checkbox', 'aria-label': 'Choose all runs shown', onchange: event => {
-      for (const run of ui.list.slice(0, ui.drawn)) event.target.checked ? chosen.add(run.id) : chosen.delete(run.id);
-      body();
-      selection();
-    } });
-    const heads = ui.columns.map(name => (about.keys.includes(name) ? cell(name, short.get(name), { title: name }) : metric(name)));
+    const all = h('input', { type: 'checkbox', 'aria-label': 'Choose all runs shown', onchange: event => pick(ui.list.slice(0, ui.drawn), event.target.checked) });
+    const heads = ui.columns.map(name => (about.keys.includes(name) ? cell(name, short.get(name), { title: name, 'data-csv': name }) : metric(name)));
     replace(table.tHead ?? table.createTHead(), h('tr', {}, h('th', { scope: 'col', class: 'pick' }, all), cell('name', 'run'), cell('status', 'status'), heads, cell('started', 'started', { class: 'n' }), cell('seconds', 'took', { class: 'n' })));
+  }
+
+  function pick(list, on) {
+    for (const run of list) on ? chosen.add(run.id) : chosen.delete(run.id);
+    body();
+    selection();
   }
 
   function body() {
     const least = {};
     for (const name of ui.data.length < 2 ? ui.columns.filter(one => about.metrics.includes(one)) : []) {
       const values = ui.list.map(run => run.metrics[name]).filter(value => typeof value === 'number');
-      if (values.length > 1) least[name] = bestOf(name, values);
+      if (values.length > 1 && !ui.groupOf) least[name] = bestOf(name, values);
     }
     const focused = document.activeElement?.dataset?.run;
     const shown = ui.list.slice(0, ui.drawn);
-    const rows = h('tbody', {}, shown.map(run => line(run, least)));
+    const groups = new Map();
+    for (const run of ui.groupOf ? ui.list : []) groups.set(ui.groupOf(run), [...groups.get(ui.groupOf(run)) ?? [], run]);
+    const rows = h('tbody', {}, ui.groupOf ? [...groups].map(([group, list]) => [groupLine(group, list), ui.open.has(group) ? list.map(run => line(run, least)) : []]) : shown.map(run => line(run, least)));
     table.tBodies[0] ? table.tBodies[0].replaceWith(rows) : table.append(rows);
     if (focused) rows.querySelector(`[data-run="${CSS.escape(focused)}"]`)?.focus();
-    more.hidden = shown.length >= ui.list.length;
+    more.hidden = Boolean(ui.groupOf) || shown.length >= ui.list.length;
     more.textContent = `${number(ui.list.length - shown.length)} more`;
   }
 
+  function groupLine(group, list) {
+    const open = ui.open.has(group);
+    const toggle = () => { if (!ui.open.delete(group)) ui.open.add(group); body(); selection(); };
+    const all = h('input', { type: 'checkbox', checked: list.every(run => chosen.has(run.id)), 'aria-label': `Choose the runs of ${group}`, onchange: event => pick(list, event.target.checked) });
+    const key = name => {
+      const values = [...new Set(list.map(run => ui.words.get(name)(run.config[name])))];
+      return h('td', { class: 'value', title: values.join(', ') }, values.length === 1 ? values[0] : h('span', { class: 'faint' }, `${values.length} values`));
+    };
+    const states = STATES.map(name => [name, list.filter(run => run.status === name).length]).filter(([, count]) => count);
+    return h('tr', { class: 'group' }, h('td', { class: 'pick' }, all), h('th', { scope: 'row' }, h('button', { type: 'button', 'aria-expanded': String(open), onclick: toggle }, h('span', { class: 'name', title: group }, `${open ? '▾' : '▸'} ${group}`)), h('span', { class: 'id' }, `${list.length} ${list.length === 1 ? 'run' : 'runs'}`)),
+      h('td', {}, states.map(([name, count]) => [state(name), ` ${count} `])), ui.columns.map(name => (about.keys.includes(name) ? key(name) : groupCell(list, name, ui.base))), h('td'), h('td'));
+  }
+
   function line(run, least) {
-    const pick = h('input', { type: 'checkbox', checked: chosen.has(run.id), 'data-run': run.id, 'aria-label': `Choose ${nameOf(run)}, ${run.id}`, onchange: event => {
+    const box = h('input', { type: 'checkbox', checked: chosen.has(run.id), 'data-run': run.id, 'aria-label': `Choose ${nameOf(run)}, ${run.id}`, onchange: event => {
       event.target.checked ? chosen.add(run.id) : chosen.delete(run.id);
       selection();
     } });
     const cell = name => {
-      if (about.keys.includes(name)) return h('td', { class: 'value' }, word(run.config[name]));
+      if (about.keys.includes(name)) return h('td', { class: 'value', title: word(run.config[name]), 'data-csv': run.config[name] ?? '' }, ui.words.get(name)(run.config[name]));
       const value = run.metrics[name];
-      return h('td', { class: value !== undefined && value === least[name] ? 'n least' : 'n' }, typeof value === 'number' ? metricNumber(name, value) : h('span', { class: 'faint' }, DASH));
+      return h('td', { class: value !== undefined && value === least[name] ? 'n least' : 'n', 'data-csv': value ?? '' }, measured(run, name), difference(ui.base, run.data, name, value));
     };
     return h('tr', {},
-      h('td', { class: 'pick' }, pick),
-      h('th', { scope: 'row', title: nameOf(run) }, link(address('run', run.id), nameOf(run)), h('span', { class: 'id' }, run.id.slice(0, 8)), tags(run), run.note && h('span', { class: 'note', title: run.note }, run.note)),
-      h('td', {}, status(run)), ui.columns.map(cell),
-      h('td', { class: 'n faint', title: date(run.started) }, ago(run.started)), h('td', { class: 'n faint' }, duration(run.seconds)));
+      h('td', { class: 'pick' }, box),
+      h('th', { scope: 'row', 'data-csv': `${run.name} ${run.id}` }, link(address('run', run.id), h('span', { class: 'name', title: run.name }, nameOf(run))), h('span', { class: 'id' }, run.id.slice(0, 8)), tags(run), run.note && h('span', { class: 'note', title: run.note }, run.note)),
+      h('td', { 'data-csv': run.status }, status(run)), ui.columns.map(cell),
+      h('td', { class: 'n faint', title: date(run.started), 'data-csv': run.started }, ago(run.started)), h('td', { class: 'n faint', 'data-csv': run.seconds ?? '' }, duration(run.seconds)));
   }
 
   function selection() {
@@ -152,35 +209,40 @@ export async function page(name, route) {
     remember({ sel: ids.join(',') });
     compare.textContent = ids.length ? `Compare ${ids.length}` : 'Compare';
     compare.disabled = !ids.length;
+    const done = deleted => { if (deleted) chosen.clear(); draw(); };
+    replace(picked, ids.length ? [h('span', { class: 'count' }, `${ids.length} chosen:`), buttons(ids, done), ids.length === 1 ? button('Baseline', () => set({ base: ids[0] }), 'Show differences from this run') : null] : null);
     for (const row of table.tBodies[0]?.rows ?? []) row.classList.toggle('chosen', chosen.has(row.querySelector('input').dataset.run));
+  }
+
+  async function readViews() {
+    ui.views = inFile ? {} : (await ask('views')).views;
+    draw();
   }
 
   const title = only ? `${only.length} runs` : 'Runs';
   const element = h('div', { class: 'page wide' },
     only && h('p', { class: 'trail' }, link('#/runs', 'Runs')),
     h('div', { class: 'bar' }, h('h1', {}, title), counted, h('label', { class: 'search' }, h('span', { class: 'hidden' }, 'Filter of runs'), filter), compare),
-    dataSets, scroll, nothing, panel && section('Curves', panel.element));
+    only ? null : happening, dataSets, tools, picked, scroll, remarks, nothing, plot, panel && section('Curves', panel.element));
   async function update() {
-    draw();
+    draw(true);
     await panel?.update();
   }
-  await update();
+  await readViews();
+  await panel?.update();
   return { title, element, update: () => { update(); say(`${ui.list.length} runs`); } };
 }
 
-export const tags = run => run.tags.map(tag => h('span', { class: 'tag' }, tag));
-
-// The state of a run in words, and the progress of one that trains.
-export function status(run) {
-  if (run.damage.length) return h('span', { class: 'state damaged', title: run.damage.join('; ') }, 'damaged');
-  const [first, last] = [run.recent[0], run.recent.at(-1)];
-  if (run.status !== 'training' || !last || !run.steps) return state(run.status, run.failure || undefined);
-  const pace = last[0] > first[0] ? (last[1] - first[1]) / (last[0] - first[0]) : null;
-  const share = Math.min(last[0] / run.steps, 1);
-  const percent = `${Math.floor(100 * share)} %`;
-  const remaining = share < 1 && pace ? `${duration((run.steps - last[0]) * pace)} remaining` : '';
-  return h('span', { class: 'state running' }, h('progress', { value: share, max: 1, 'aria-label': `${percent} trained` }), h('span', {}, percent), h('small', {}, remaining));
+// A metric of a run, with a mark if a reader must know something about it.
+export function measured(run, name) {
+  const value = run.metrics[name];
+  if (value === undefined || value === null) return h('span', { class: 'faint' }, DASH);
+  if (typeof value !== 'number') return h('span', { class: 'bad', title: 'Not a number in at least one test clip' }, value === 'nan' ? 'NaN' : value);
+  const mark = run.marks[name.startsWith('latency') ? 'latency' : 'errors'];
+  return [metricNumber(name, value), mark && !/parameters|macs|bytes/.test(name) ? h('abbr', { class: 'mark', title: mark, 'aria-label': mark }, '*') : null];
 }
+
+export const tags = run => run.tags.map(tag => h('span', { class: 'tag' }, tag));
 
 function sorted(list, sort) {
   const down = sort.startsWith('-');

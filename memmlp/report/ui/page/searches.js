@@ -2,9 +2,9 @@
 
 import { cards, h, replace, link, section, empty, select, table } from './dom.js';
 import { address, ask, place, remember, runs } from './store.js';
-import { scatter } from './charts.js';
-import { number, shortKeys, word } from './format.js';
-import { state } from './runs.js';
+import { scatter, spans } from './charts.js';
+import { columnWords, duration, number, shortKeys, word } from './format.js';
+import { state } from './state.js';
 
 const WORDS = { complete: 'done', fail: 'failed', pruned: 'stopped', running: 'running' };
 const values = trial => trial.values.map(value => number(value, 3)).join(', ');
@@ -60,8 +60,16 @@ function body(search, update) {
     search.objectives.length > 1 ? h('div', { class: 'tools' }, select('Objective', search.objectives.map(one => [one, one]), objective, value => { remember({ objective: value }); update(); })) : null,
     search.objectives.length === 2 ? section('Pareto front', scatter(points, { x: search.objectives[0], y: search.objectives[1], open })) : null,
     h('div', { class: 'pair' }, section('History', scatter(history, { x: 'trial', y: objective, open })), importance && section('Importance', importance)),
+    section('Slices', h('p', { class: 'faint' }, `${objective} by the value of each key.`), h('div', { class: 'charts' }, search.keys.map(key => h('div', { class: 'panel-chart' }, scatter(
+      history.filter(point => point.params[key] !== undefined).map(point => ({ ...point, x: typeof point.params[key] === 'number' ? point.params[key] : word(point.params[key]), best: search.front.includes(point.number) })), { x: short.get(key), y: objective, open, joined: false, log: search.log.includes(key) }))))),
+    timeline(search),
     trials(search, short),
   ];
+}
+
+function timeline(search) {
+  const rows = search.trials.filter(trial => trial.began).map(trial => ({ ...trial, kind: WORDS[trial.state] ?? trial.state, ended: trial.ended ?? Date.now() / 1000 }));
+  return rows.length ? section('Timeline', spans(rows.map(row => ({ ...row, text: `trial ${row.number}, ${row.kind}, ${duration(row.ended - row.began)}` })), { label: 'Trials by time' })) : null;
 }
 
 function runLink(trial) {
@@ -70,7 +78,11 @@ function runLink(trial) {
 
 function trials(search, short) {
   const order = [...search.trials].sort((a, b) => (a.values[0] ?? Infinity) - (b.values[0] ?? Infinity) || a.number - b.number);
+  const words = new Map(search.keys.map(key => [key, columnWords(search.trials.map(trial => trial.params[key]))]));
   const row = trial => [runLink(trial), state(WORDS[trial.state] ?? trial.state, trial.reason), ...search.objectives.map((_, i) => number(trial.values[i] ?? null, 3)),
-    ...search.keys.map(key => (typeof trial.params[key] === 'number' ? number(trial.params[key]) : word(trial.params[key])))];
-  return section('Trials', table(['trial', 'state', ...search.objectives, ...search.keys.map(key => short.get(key))], order.map(row)));
+    ...search.keys.map(key => words.get(key)(trial.params[key]))];
+  const grid = table(['trial', 'state', ...search.objectives, ...search.keys.map(key => short.get(key))], order.map(row));
+  const chosen = order.findIndex(trial => String(trial.number) === place().query.get('trial')); // linked from its run
+  if (chosen >= 0) grid.querySelectorAll('tbody tr')[chosen].classList.add('chosen');
+  return section('Trials', grid);
 }

@@ -1,15 +1,18 @@
 // What the page knows: the runs, read again when they change; other answers by their addresses.
 
+import { shortNames } from './format.js';
+
 const embedded = document.getElementById('answers');
 const answers = embedded ? JSON.parse(embedded.textContent) : null;
 export const inFile = answers !== null; // the page is a file without a server
 export const generated = answers?.about ?? '';
 
 export const runs = new Map();
-export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', state: '' };
+export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', state: '', preparing: [], after: null, writable: false };
 const PAUSE = 1000; // milliseconds between two questions for changes
 let dataNames = new Map();
 let ambiguous = new Set(); // names of runs on several data sets
+let short = new Map(); // names with rounded numbers
 
 // The answer to a question such as 'run/0123...'. Throws an Error with the server's message.
 export async function ask(path) {
@@ -40,12 +43,16 @@ export async function load() {
   dataNames = new Map([...runs.values()].filter(run => run.data && run.data_name).map(run => [run.data, `${run.data_name} ${run.data}`]));
   const seen = new Map();
   for (const run of runs.values()) seen.set(run.name, (seen.get(run.name) ?? new Set()).add(run.data));
+  short = shortNames([...seen.keys()]);
   ambiguous = new Set([...seen].filter(([, data]) => data.size > 1).map(([name]) => name));
   return true;
 }
 
 export const dataName = data => dataNames.get(data) ?? data;
-export const nameOf = run => (ambiguous.has(run.name) ? `${run.name} · ${dataName(run.data) || 'unknown data'}` : run.name);
+export function nameOf(run) {
+  const name = short.get(run.name) ?? run.name;
+  return ambiguous.has(run.name) ? `${name} · ${dataName(run.data) || 'unknown data'}` : name;
+}
 
 // A row with its config and metrics by name, and the text in which words are looked for.
 function readable(row) {

@@ -2,12 +2,13 @@
 
 import { cards, h, replace, link, section, empty, table, select } from './dom.js';
 import { address, ask, generated, inFile, nameOf, place, remember, runs } from './store.js';
+import { button, canChange, change, command, dialog } from './actions.js';
 import { curvePanel } from './curves.js';
 import { forest, frontier } from './charts.js';
-import { ACTIVE, look, state, STATE_WORDS } from './runs.js';
+import { ACTIVE, look, state, STATE_WORDS } from './state.js';
 import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
 
-const ORDER = ['done', ...ACTIVE, 'trained', 'lost', 'stopped', 'new', 'failed', 'damaged', 'blocked'];
+const ORDER = ['done', ...ACTIVE, 'trained', 'lost', 'stopped', 'interrupted', 'new', 'failed', 'damaged', 'blocked'];
 
 export async function page() {
   const element = h('div', { class: 'page' });
@@ -40,7 +41,7 @@ export async function single(name) {
   const element = h('div', { class: 'page' }, top, ids.length ? section('Curves by variant', panel.element) : null, notes(sweep.table));
   function draw() {
     replace(top, h('p', { class: 'trail' }, link('#/sweeps', 'Sweeps')), h('div', { class: 'bar' }, h('h1', {}, sweep.table.caption)),
-      sweep.name === sweep.table.caption ? null : h('p', { class: 'faint' }, sweep.name), sweep.counts.done === sweep.tasks ? null : progress(sweep), sweep.cells.length ? board(sweep) : null,
+      sweep.name === sweep.table.caption ? null : h('p', { class: 'faint' }, sweep.name), sweep.counts.done === sweep.tasks ? null : progress(sweep), again(sweep), sweep.cells.length ? board(sweep) : null,
       effects(sweep.table, draw), frontiers(sweep.table), section('Table', results(sweep.table)), sweep.rounds ? rounds(sweep.rounds) : null);
   }
   async function update() {
@@ -51,6 +52,16 @@ export async function single(name) {
   draw();
   await panel.update();
   return { title: sweep.title, element, update };
+}
+
+// The command of a sweep, and buttons for its unfinished runs.
+function again(sweep) {
+  const ids = states => sweep.cells.filter(cell => states.includes(cell.state)).map(cell => cell.id);
+  const [going, waiting] = [ids([...ACTIVE, 'new', 'interrupted', 'lost', 'trained']), ids(['failed', 'stopped', 'damaged'])];
+  const send = (action, list) => change({ action, runs: list }).catch(error => dialog('Not done', { lines: [error.message], word: 'Close', act: () => {} }));
+  const open = document.querySelector('details.again')?.open; // before it is drawn again
+  return h('details', { class: 'again', open }, h('summary', {}, 'Command'), command(sweep.command),
+    canChange() ? h('div', { class: 'chips' }, going.length ? button(`Stop ${going.length} unfinished`, () => send('stop', going)) : null, waiting.length ? button(`Retry ${waiting.length} stopped or failed`, () => send('retry', waiting), 'Its workers continue them; without workers, repeat the command') : null) : null);
 }
 
 // The tables of all sweeps below each other.
