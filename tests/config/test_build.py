@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from memmlp.config.build import build_experiment, make_readable_name
+from memmlp.config.build import build_experiment, list_overrides, make_readable_name
 from memmlp.config.compose import compose_config
+from memmlp.runs.identity import select_training_config
 from memmlp.training.run_stages import Experiment
 
 TINY = [
@@ -72,3 +73,12 @@ def test_a_vqvae_and_a_component_of_ones_own():
     assert make_readable_name("vqvae", codes) == "VQ-VAE · vqvae.codes=9 · seed 4"
     mine = whole | {"memory": {"name": "mine", "knob": 3}}
     assert make_readable_name("memmlp", mine) == "memory=mine · seed 0"
+
+
+def test_the_overrides_of_a_recorded_config_compose_it_again():
+    given = ["data=synth", "profile=tiny", "memory=gru", "seed=3", "vqvae.seed=0", "optim.lr=0.0123"]
+    config = OmegaConf.to_container(compose_config(given), resolve=True)
+    words = list_overrides(config)
+    assert {"profile=tiny", "memory=gru", "seed=3", "vqvae.seed=0", "optim.lr=0.0123"} <= set(words)
+    again = OmegaConf.to_container(compose_config(words), resolve=True)
+    assert select_training_config(again) == select_training_config(config)
