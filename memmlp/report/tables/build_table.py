@@ -107,7 +107,7 @@ def list_official_values(
             if one.run
             and (one.run.manifest["imported"]["model"] == model)
             and data in (None, one.run.config["data"]["name"])
-            and refiner in ("null", (one.run.config["refiner"] or {}).get("name"))
+            and (None if refiner == "null" else refiner) == (one.run.config["refiner"] or {}).get("name")
         ]
         trained = list(runs.get(variant.label, {}).values())
         printed = variant.paper or {}
