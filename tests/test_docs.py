@@ -1,13 +1,11 @@
 """Documentation is correct: commands parse and compose, links lead somewhere."""
 
-import importlib
 import re
 import runpy
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import click
@@ -263,12 +261,6 @@ def anchors(path: Path) -> set[str]:
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     slugs = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
     return slugs | set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
-
-
-@pytest.fixture
-def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(DOCS)
-    return importlib.import_module("reference")
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
 
 
 def make_command(run: Run) -> str:
-    """Return the command that trains a network's run again. Raises InputError if there is none."""
+    """Return the command that trains a network's run again. Raises InputError if it cannot."""
     from memmlp.common.errors import InputError
     from memmlp.common.text_formats import join_command
     from memmlp.config.build import list_overrides

@@ -56,6 +56,7 @@ def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None, monkeypatch: pyt
     (["14", "--out", "/proc/nothing/t.md"], ("--out /proc/nothing/t.md",)),
     (["14", "--mode", "both modes"], ("--mode",)),
     (["14", "--branch", "head"], ("--branch", "rotation", "combined")),
+    (["5", "--untrained"], ("--untrained: sweep table05 shows MPJRE, MPJPE", "FLOPs, MACs")),
 ])  # fmt: skip
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):
     assert one_line(memmlp("table", *arguments), *words)

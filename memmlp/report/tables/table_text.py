@@ -210,7 +210,7 @@ def _summarize_agreement(table: Table) -> str:
 
 
 def explain_marks(table: Table) -> str:
-    """Explain ✓ and ✗ beside the paper's differences; empty if the table has none."""
+    """Explain ✓ and ✗ beside the paper's differences; empty without them."""
     cells = [cell for row in table.rows for cells in row.cells.values() for cell in cells.values()]
     if all(cell.agrees is None for cell in cells):
         return ""

@@ -267,22 +267,6 @@ def test_prerequisite_runs_of_different_origin(flags: Callable[..., list[str]], 
         assert not any(words in flag for flag in before)
 
 
-def test_runs_from_before_code_changed(flags: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch):
-    now = {"training/loop.py": "1", "ik.py": "1", "new.py": "1", "mine:mine.py": "2"}
-    monkeypatch.setattr("memmlp.report.tables.flags.compute_code_digests", lambda packages: now)
-    code = {"training/loop.py": "1", "ik.py": "1", "gone.py": "0"}
-
-    def changed(old: dict[str, dict]) -> list[str]:
-        return flags(
-            "has changed since", lambda label, _: {"origin": {"sources": code | old.get(label, {})}}, (0, 1)
-        )
-
-    (flag,) = changed({"full_model": {"ik.py": "0"}, "by position": {"mine:mine.py": "1"}})
-    assert flag.startswith("code of ik.py, mine:mine.py has changed since these runs")
-    assert flag.endswith(": 'by position', 'full_model'")
-    assert changed({}) == []
-
-
 def test_variants_that_saw_more_in_training(flags: Callable[..., list[str]]):
     """A window twice as long, or a batch twice as large, is twice the data a step."""
 
@@ -354,15 +338,6 @@ def test_seeds_that_share_a_vqvae(flags: Callable[..., list[str]]):
     (flag,) = flags("share one VQ-VAE", lambda *_: {"origin": {"prerequisite": "v"}}, (0, 1))
     assert flag.endswith(EVERY)
     assert flags("share one VQ-VAE", lambda _, seed: {"origin": {"prerequisite": f"v{seed}"}}, (0, 1)) == []
-
-
-@pytest.mark.parametrize(
-    ("number", "body", "count"), [(1, "builtin", 1), (1, "SMPL-H", 0), (4, "builtin", 0)]
-)
-def test_the_built_in_body_beside_smplh_numbers(
-    flags: Callable[..., list[str]], number: int, body: str, count: int
-):
-    assert len(flags("data.body", lambda *_: {"origin": {"body": body}}, table=number)) == count
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ export async function page(id) {
   return { title: nameOf(run), element, update, close: () => replay?.close() };
 }
 
-// After a change of a run: its page is read again; a deleted run has none.
+// After a change of a run: its page is read again; that of a deleted run is gone.
 const after = deleted => { if (deleted) location.hash = address('runs'); else dispatchEvent(new Event('hashchange')); };
 
 function head(run) {
