@@ -152,6 +152,11 @@ def storm(
             code = processes[index].poll()
             if code not in (None, 0) or (code == 0 and killed < kills):
                 processes[index] = launch()
+    wait_for_release(outputs)
+
+
+def wait_for_release(outputs: Path) -> None:
+    """Wait until no process holds a run; a sweep or search may end a second before its last worker."""
     end = time.monotonic() + PATIENCE
     while any(Lock(folder).is_held for folder in outputs.glob("runs/*/")) and time.monotonic() < end:
         time.sleep(0.1)

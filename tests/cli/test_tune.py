@@ -10,7 +10,7 @@ import pytest
 from command_line import BRIEF, run_apart
 from command_line import run as command
 
-from benchmarks.chaos import examine
+from benchmarks.chaos import examine, wait_for_release
 from memmlp.cli.tune import prepare_search, search
 from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError
@@ -29,6 +29,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a search of two trials, each of two seeds, in a folder of its own."""
     folder = tmp_path_factory.mktemp("tune")
     (folder / "said.txt").write_text(run_apart(folder, "tune", *TINY, *TRIALS, "--workers", "1"))
+    wait_for_release(folder / "outputs")
     return folder
 
 
