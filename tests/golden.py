@@ -146,7 +146,8 @@ def rollout(make: Callable[[], Rollout]) -> Numbers:
         call = slot.draw(model, split, draws, step)
         slot.keep(model.advance(call.sparse, call.state)[1])
         found |= summary(f"sparse {step}", call.sparse) | summary(f"truth {step}", call.true_frames)
-        found |= summary(f"history {step}", call.state["motion"])
+        # only what the call recalls, the newest frames of the window that ends before it
+        found |= summary(f"history {step}", call.state["motion"][:, -model.frames :])
     return found
 
 

@@ -270,6 +270,10 @@ class MemMLP(MotionModel):
         """The number of past input frames that the memory needs in the buffer."""
         return self.memory.past_frames
 
+    def count_past(self, new: int) -> int:
+        """Return how many past frames a call with this many new frames depends on."""
+        return self.memory.count_past(new)
+
     def initial_state(self, batch: int = 1) -> State:
         """Return the initial state, all zeros.
 

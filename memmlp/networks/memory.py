@@ -151,6 +151,10 @@ class Memory(nn.Module):
         """Make a memory block for the predictor's branches (Table 8)."""
         raise InputError("memory: must have memory blocks, since the predictor uses them")
 
+    def count_past(self, new: int) -> int:
+        """Return how many past frames a call with this many new frames depends on."""
+        return self.past_frames
+
     def initial_state(self, batch: int) -> State:
         """Return the memory's initial state, zeros."""
         return {}

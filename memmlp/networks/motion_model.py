@@ -79,6 +79,10 @@ class MotionModel(nn.Module):
         """The number of past input frames in the buffer, which ends just before the new frames."""
         return self.frames - 1
 
+    def count_past(self, new: int) -> int:
+        """Return how many past frames a call with this many new frames depends on; at most `past_frames`."""
+        return self.past_frames
+
     @property
     def stride(self) -> int:
         """The number of frames by which a training step advances: the shift, or 1 without a past."""
@@ -110,7 +114,7 @@ class MotionModel(nn.Module):
         """
         before = torch.where(state["started"][..., None] > 0, state["sparse"], sparse[:, :1])
         inputs = torch.cat([before, sparse], 1)
-        return inputs, {"sparse": inputs[:, -self.past_frames :], "started": state["started"].clamp_min(1)}
+        return inputs, {"sparse": inputs[:, sparse.shape[1] :], "started": state["started"].clamp_min(1)}
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Process the newest frames.

@@ -230,9 +230,12 @@ class OwnPastMemory(FeatureMemory):
         self.shift = {"frame": 1, "window": self.frames}[settings.shift]
         self.past_frames = self.frames + self.shift - 1
 
+    def count_past(self, new: int) -> int:
+        return self.frames + max(self.shift - new, 0)
+
     def initial_state(self, batch: int) -> State:
         """Return zeros as the past motion, the paper's fallback without previous predictions."""
-        return {"motion": torch.zeros(batch, self.past_frames, MOTION_DIM)}
+        return {"motion": torch.zeros(1, 1, 1).expand(batch, self.past_frames, MOTION_DIM)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
         """Return the true motion (B, past, 198) as history, for teacher forcing."""
@@ -246,10 +249,8 @@ class OwnPastMemory(FeatureMemory):
 
         They end `shift` frames before the newest frame, but at the latest just before the first new frame.
         """
-        # The buffers begin T + shift - 1 frames before the first new one, so the window begins at new - 1,
-        # but not after shift - 1: the motion of the new frames is not known yet.
-        start = min(new, self.shift) - 1
-        view = slice(start, start + self.frames)
+        end = state["motion"].shape[1] - max(self.shift - new, 0)  # motion of new frames is not known yet
+        view = slice(end - self.frames, end)
         sparse, motion = sparse[:, view].contiguous(), state["motion"][:, view].contiguous()
         return Past(sparse, motion, self.compute_code_vectors(sparse, motion))
 
@@ -260,7 +261,7 @@ class OwnPastMemory(FeatureMemory):
     def remember(self, motion: Tensor, past: Past | RecurrentPast | None, state: State, new: int) -> State:
         buffer = torch.cat([state["motion"][:, new:], motion[:, -new:]], 1)
         if self.history == "latest":
-            buffer = torch.cat([buffer[:, : self.past_frames - self.frames], motion], 1)
+            buffer = torch.cat([buffer[:, : -self.frames], motion], 1)
         return {"motion": buffer}
 
 

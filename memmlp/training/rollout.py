@@ -56,7 +56,8 @@ class TeacherForcing(Rollout):
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
         clips, end = map(distributed.take_local_rows, sampler.draw(step))
-        past, stride = model.past_frames, model.stride
+        stride = model.stride
+        past = model.count_past(stride)
         stretch = dataset.read_stretches(clips, end, past + stride)
         state = model.true_state(stretch[:, :past])
         return TrainingCall(stretch[:, past:, :SPARSE_DIM], state, stretch[:, -model.frames :], clips)

@@ -1,6 +1,6 @@
 """The interface of losses: terms by name, and how they are weighted."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import ClassVar
 
@@ -19,6 +19,11 @@ Terms = dict[str, Tensor]
 def joints(motion: Tensor) -> Tensor:
     """Return the joint positions (B, T, 22, 3) of motion (B, T, 198)."""
     return motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
+
+
+def select_joints(positions: Tensor, indices: Sequence[int]) -> Tensor:
+    """Return some joints (B, T, n, 3) of (B, T, 22, 3). Its backward is quicker than that of indexing."""
+    return positions.index_select(2, torch.tensor(indices, device=positions.device))
 
 
 def read_weights(settings: Settings) -> dict[str, float]:
@@ -123,9 +128,8 @@ class UncertaintyWeights(nn.Module):
 
     def forward(self, terms: Terms) -> Tensor:
         """Return the weighted sum of the terms."""
-        return torch.stack(
-            [(-(s := self.s[name])).exp() * term + s * (term.detach() != 0) for name, term in terms.items()]
-        ).sum()
+        values, s = torch.stack(list(terms.values())), torch.stack([self.s[name] for name in terms])
+        return ((-s).exp() * values + s * (values.detach() != 0)).sum()
 
     def weights(self) -> Mapping[str, float]:
         """Return the current weight e^-s of each term."""

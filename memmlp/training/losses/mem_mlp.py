@@ -17,7 +17,7 @@ from memmlp.common.settings import Settings
 from memmlp.motion.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.training.losses.loss import Loss, Terms, Weighting, joints
+from memmlp.training.losses.loss import Loss, Terms, Weighting, joints, select_joints
 
 
 def l1(error: Tensor) -> Tensor:
@@ -52,8 +52,7 @@ class PositionHandTerm:
     branch = "position"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        hands = list(HANDS)
-        return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
+        return {"hand": l1(select_joints(joints(motion), HANDS) - select_joints(joints(truth), HANDS))}
 
 
 @component("hand", "fk")
@@ -65,10 +64,8 @@ class KinematicHandTerm:
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return the hand term for motion and truth (B, T, 198) and inputs (B, T, 54), all in the world."""
-        hands = list(HANDS)
-        return {
-            "hand": l1(normalizer.compute_positions(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])
-        }
+        positions = normalizer.compute_positions(motion, sparse)
+        return {"hand": l1(select_joints(positions, HANDS) - select_joints(joints(truth), HANDS))}
 
 
 Hand = NoHandTerm | PositionHandTerm | KinematicHandTerm
@@ -125,7 +122,7 @@ class MotionLoss(Loss):
         if "rotation" in self.branches:  # Eqs. 1 and 2
             terms |= {"rotation_all": l1(rotation), "rotation_velocity": l1(rotation.diff(dim=1))}
         if "position" in self.branches:  # Eqs. 3 and 4, whose velocities are those of the lower body
-            lower = position.unflatten(-1, (N_JOINTS, 3))[:, :, list(LOWER)]
+            lower = select_joints(position.unflatten(-1, (N_JOINTS, 3)), LOWER)
             terms |= {"position_branch": l1(position), "velocity_lower_body": l1(lower.diff(dim=1))}
         if self.hand.branch in self.branches:
             terms |= self.hand(motion, truth, sparse, normalizer)

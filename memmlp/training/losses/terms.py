@@ -24,6 +24,7 @@ from memmlp.training.losses.loss import (
     UncertaintyWeights,
     Weighting,
     joints,
+    select_joints,
 )
 
 FEET = (7, 8, 10, 11)  # both ankles, both toes
@@ -128,7 +129,7 @@ class Comparison:
 
     def hand(self, error: Error) -> Tensor:
         """Return the error of both wrists' positions, with the head on its tracker."""
-        return error((self.positions - self.true_positions)[..., list(HANDS), :])
+        return error(select_joints(self.positions - self.true_positions, HANDS))
 
     def velocity(self, error: Error, step: int = 1) -> Tensor:
         """Return the error of the joints' movement between every `step`-th frame."""
@@ -147,7 +148,7 @@ class Comparison:
 
     def contact(self, error: Error) -> Tensor:
         """Return the error of the predicted feet's movement while the true feet stand still."""
-        return error(self.positions[:, :, list(FEET)].diff(dim=1) * self.standing[..., None])
+        return error(select_joints(self.positions, FEET).diff(dim=1) * self.standing[..., None])
 
     def penetration(self, error: Error) -> Tensor:
         """Return how far the lowest predicted joint is below the window's floor, averaged over frames."""
