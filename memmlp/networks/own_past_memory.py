@@ -259,7 +259,8 @@ class OwnPastMemory(FeatureMemory):
         raise NotImplementedError
 
     def remember(self, motion: Tensor, past: Past | RecurrentPast | None, state: State, new: int) -> State:
-        buffer = torch.cat([state["motion"][:, new:], motion[:, -new:]], 1)
+        kept = state["motion"][:, new:]
+        buffer = torch.cat([kept, motion[:, -new:]], 1) if kept.shape[1] else motion
         if self.history == "latest":
             buffer = torch.cat([buffer[:, : -self.frames], motion], 1)
         return {"motion": buffer}
