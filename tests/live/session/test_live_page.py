@@ -85,7 +85,8 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
     slide = f"s.value = {early}; s.dispatchEvent(new Event('input'))"
     browser.value(f"(s => {{ {slide} }})(document.querySelector('#scrub'))")
     browser.wait(f"{SHOWN} == {early}")
-    assert (np.abs(stage(browser) - still).max(-1) > 30).mean() > 0.002
+    moved = lambda: (np.abs(stage(browser) - still).max(-1) > 30).mean() > 0.002  # noqa: E731
+    until(moved, "another picture")
 
     browser.click("#newest")
     browser.wait(f"{SHOWN} > {stopped} + 20")
