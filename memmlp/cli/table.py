@@ -137,14 +137,24 @@ def print_needed_seeds(tables: Sequence[SweepTable], modes: Sequence[str]) -> No
 
 def print_official_values(tables: Sequence[SweepTable], outputs: Path, modes: Sequence[str]) -> None:
     """Print published values, values of imported weights and values of trainings, for each sweep."""
-    from memmlp.report.tables.build_table import find_imported_runs, list_official_values
+    from memmlp.report.tables.build_table import (
+        find_imported_runs,
+        find_official_runs,
+        list_official_values,
+    )
     from memmlp.report.tables.table_text import make_caption
 
     imported = find_imported_runs(outputs)
     for one in tables:
-        head = ("variant", "weights", "mode", *one.sweep.metrics)
+        head = ("variant", "mode", "metric", "published", "weights, authors' test", "weights", "trained here")
         rows = list_official_values(one.sweep, one.runs, imported, modes)
-        click.echo("\n".join([make_caption(one.table), *align_columns([head, *rows], left=3), ""]))
+        files = [
+            f"{variant.label}: weights {run.origin.imported}"
+            for variant in one.sweep.variants
+            for run in find_official_runs(one.sweep, variant, imported)
+        ]
+        lines = [*align_columns([head, *rows], left=3), *files, ""]
+        click.echo("\n".join([make_caption(one.table), *lines]))
 
 
 class TableSelection(NamedTuple):

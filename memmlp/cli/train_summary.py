@@ -10,7 +10,7 @@ from rich.text import Text
 
 from memmlp.common.processes import MIN_CORE_FRACTION
 from memmlp.common.text_formats import make_console
-from memmlp.evaluation.metric_facts import UNITS
+from memmlp.evaluation.metric_facts import AUTHORS, UNITS
 from memmlp.report.tables.measured_run import (
     CORE_FRACTION_KEYS,
     Errors,
@@ -31,7 +31,7 @@ from memmlp.sweep.definition import BRANCHES
 from memmlp.training.request import Outcome
 
 STAGES = ("training", "evaluation", "deployment")
-MODES_AND_BRANCHES = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
+MODES_AND_BRANCHES = [(mode, branch) for mode in ("stream", "window") for branch in (*BRANCHES, AUTHORS)]
 
 
 def show(outcome: Outcome) -> None:

@@ -34,6 +34,7 @@ from memmlp.config.compose import VERSION_BASE, compose_config
 from memmlp.config.schema import restore_config
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
+from memmlp.evaluation.metric_facts import METRIC_SETS
 from memmlp.evaluation.metrics import UserMetric
 from memmlp.evaluation.modes import Evaluation
 from memmlp.motion.body import make_builtin_rest_joints
@@ -83,6 +84,7 @@ def build_experiment(cfg: DictConfig, remote: bool = False) -> Experiment:
             ik=build_ik(cfg),
             seed=cfg.seed,
             metrics=metrics,
+            metric_set=METRIC_SETS.get(cfg.evaluation.metric_set),
         ),
         deployment=build_deployment(cfg),
         loggers=build_loggers(cfg),

@@ -17,6 +17,7 @@ from memmlp.common.overrides import format_value, parse_overrides
 from memmlp.common.text_formats import make_override
 from memmlp.config.build import build_experiment, load_config
 from memmlp.config.compose import compose_config
+from memmlp.evaluation.metric_facts import METRIC_SETS
 from memmlp.motion.body import ROTATION, load_rest_joints
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import PreparedMotion, ShippedMotion
@@ -137,7 +138,8 @@ def import_weights(
     digest = hashlib.sha256("".join(map(file_digest, (*files, *statistics))).encode()).hexdigest()
     tensors, sizes = _read_published(path, release)
     refining, more = _read_published(refiner, SAGERefinerSettings.release) if refiner else ({}, {})
-    values = {"profile": "paper", **release.config, **sizes, **more}
+    released_test = next(key for key, one in METRIC_SETS.items() if one.source == release.source)
+    values = {"profile": "paper", "evaluation.metric_set": released_test, **release.config, **sizes, **more}
     words = [f"model={name}", *(["refiner=sage"] if refiner else [])]
     words += [f"{key}={format_value(value)}" for key, value in values.items()]
     cfg = compose_config([*words, *overrides, make_override("imported_weights", digest[:16])])

@@ -28,6 +28,7 @@ from memmlp.common.settings import (
     within,
 )
 from memmlp.common.text_formats import escape_interpolations
+from memmlp.evaluation.metric_facts import METRIC_SETS
 
 
 @dataclass
@@ -244,6 +245,9 @@ class EvaluationConfig:
     ik_iterations: int = setting(at_least(1), 15)  # maximum number of lbfgs iterations per frame (App. A)
     # paths of custom metrics (docs/guides/components.md)
     metrics: list[str] = setting(each(_metrics(), empty=True), [])
+    # the repository whose released test is measured, too, as the branch "authors"
+    # (docs/guides/published-weights.md)
+    metric_set: str | None = setting(one_of(*METRIC_SETS), None)
 
 
 @dataclass

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from memmlp.common.errors import InputError
+from memmlp.evaluation.metric_facts import MetricSet
 from memmlp.motion.body import FPS, HANDS, LOWER, ROOT, UPPER
-from memmlp.motion.geometry import compute_geodesic_angle, matrix_to_axis_angle
+from memmlp.motion.geometry import axis_angle_to_matrix, compute_geodesic_angle, matrix_to_axis_angle
 
 POSITION_GROUPS = {"Hand PE": HANDS, "Upper PE": UPPER, "Lower PE": LOWER, "Root PE": (ROOT,)}
 
@@ -24,9 +25,17 @@ def compute_mpjre(predicted: Tensor, truth: Tensor) -> Tensor:
     It compares the 63 components of joints 1-21, and wraps each difference to [-pi, pi]. The result is not an
     angle: a rotation error of 5 degrees gives 2.5 to 3.2.
     """
-    difference = matrix_to_axis_angle(predicted[:, 1:]) - matrix_to_axis_angle(truth[:, 1:])
-    wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
-    return torch.rad2deg(wrapped.abs().mean())
+    return compare_axis_angles(predicted[:, 1:], truth[:, 1:], "wrapped")
+
+
+def compare_axis_angles(predicted: Tensor, truth: Tensor, angles: str) -> Tensor:
+    """Return the mean absolute difference of the axis-angle components in degrees; see `MetricSet.angles`."""
+    difference = matrix_to_axis_angle(predicted) - matrix_to_axis_angle(truth)
+    if angles == "wrapped":
+        difference = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
+    elif angles == "turned":
+        difference = matrix_to_axis_angle(axis_angle_to_matrix(difference))
+    return torch.rad2deg(difference.abs().mean())
 
 
 def compute_geodesic_error(predicted: Tensor, truth: Tensor) -> Tensor:
@@ -73,6 +82,33 @@ def measure_rotations(predicted: Tensor, truth: Tensor) -> dict[str, float]:
         "MPJRE": float(compute_mpjre(predicted, truth)),
         "geodesic": float(compute_geodesic_error(predicted, truth)),
     }
+
+
+def measure_as_released(
+    chosen: MetricSet, rotations: tuple[Tensor, Tensor], positions: tuple[Tensor, Tensor]
+) -> dict[str, float]:
+    """Return the metrics of one clip as a repository's released test computes them.
+
+    Args:
+        chosen: the released test.
+        rotations: predicted and true rotations (N, 22, 3, 3).
+        positions: predicted and true positions (N, 22, 3).
+
+    Returns:
+        The metrics by name; empty for a clip that the test leaves out.
+    """
+    frames = len(positions[0])
+    if frames < chosen.least:
+        return {}
+    kept = slice(chosen.first, frames - (frames - chosen.least) % chosen.hop)
+    predicted, truth = (one[kept] for one in positions)
+    turns = [one[kept, (0 if chosen.root else 1) :] for one in rotations]
+    report = measure_positions(predicted, truth)
+    report["MPJRE"] = float(compare_axis_angles(*turns, chosen.angles))
+    for name, group in (("Upper PE", UPPER), ("Lower PE", LOWER)):
+        joints = {*group} - {ROOT} | ({ROOT} if chosen.root_in == name else set())
+        report[name] = float(compute_position_error(predicted, truth, tuple(joints)))
+    return {name: report[name] for name in chosen.metrics}
 
 
 @dataclass(frozen=True)

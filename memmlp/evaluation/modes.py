@@ -29,8 +29,8 @@ from torch import Tensor
 from memmlp.common.progress import progress_bar
 from memmlp.evaluation import metrics
 from memmlp.evaluation.ik import IK, NoIK
-from memmlp.evaluation.metric_facts import MIN_FRAMES
-from memmlp.evaluation.metrics import UserMetrics
+from memmlp.evaluation.metric_facts import AUTHORS, MIN_FRAMES, MetricSet
+from memmlp.evaluation.metrics import UserMetrics, measure_as_released
 from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.geometry import sixd_to_matrix
@@ -162,8 +162,9 @@ def measure_clip(
     truth: Tensor,
     ik: IK | None = None,
     custom: metrics.UserMetrics | None = None,
+    metric_set: MetricSet | None = None,
 ) -> dict[str, dict[str, float]]:
-    """Return the metrics of one clip by branch, also for the result of `ik`.
+    """Return the metrics of one clip by branch, also for the result of `ik` and as in a released test.
 
     Args:
         normalizer: the network's normalizer.
@@ -171,6 +172,7 @@ def measure_clip(
         truth: inputs and true motion (N, 252), world.
         ik: inverse kinematics; None for no additional branch.
         custom: the custom metrics by name.
+        metric_set: the released test; the branch "authors" has its metrics, unless it leaves the clip out.
     """
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
     positions = extract_positions(motion), extract_positions(target)
@@ -178,6 +180,10 @@ def measure_clip(
         custom or {}, "positions", *positions
     )
     report = {"rotation": measure_rotation_branch(normalizer, motion, truth, custom), "position": position}
+    if metric_set:
+        rotations = extract_rotations(mark_invalid_rotations(motion)), extract_rotations(target)
+        placed = normalizer.compute_positions(motion, sparse), positions[1]
+        report |= {AUTHORS: found} if (found := measure_as_released(metric_set, rotations, placed)) else {}
     solved = (ik or NoIK()).solutions(normalizer, motion, sparse)
     return report | {
         name: measure_rotation_branch(normalizer, one, truth, custom) for name, one in solved.items()
@@ -260,7 +266,8 @@ def _sort_and_pad(clips: Sequence[Tensor]) -> tuple[list[int], list[int], Tensor
 def average_clips(
     rows: Sequence[dict[str, dict[str, float]]], frames: Sequence[int]
 ) -> dict[str, dict[str, float]]:
-    """Return the mean metrics of each branch over clips; clips that are too short for a metric are skipped.
+    """Return the mean metrics of each branch over clips with this branch; clips that are too short for a
+    metric are skipped.
 
     A mean is NaN if any other clip has no value. If the network returned NaN for a clip, all means of the
     branch are NaN.
@@ -269,10 +276,11 @@ def average_clips(
         rows: the metrics of each clip by branch.
         frames: the number of frames of each clip.
     """
-    return {
-        branch: {name: _average_metric([row[branch] for row in rows], frames, name) for name in values}
-        for branch, values in rows[0].items()
-    }
+    means = {}
+    for branch, values in {name: own for row in rows for name, own in row.items()}.items():
+        having = [(row[branch], number) for row, number in zip(rows, frames, strict=True) if branch in row]
+        means[branch] = {name: _average_metric(*zip(*having, strict=True), name) for name in values}
+    return means
 
 
 def _average_metric(rows: Sequence[dict[str, float]], frames: Sequence[int], name: str) -> float:
@@ -295,6 +303,7 @@ class Evaluation:
         ik: inverse kinematics; its result is reported like an additional branch.
         seed: random seed for networks with random outputs, such as a sampled blend.
         metrics: the custom metrics by name.
+        metric_set: the released test whose metrics are measured, too; None for none.
     """
 
     modes: Sequence[str]
@@ -302,6 +311,7 @@ class Evaluation:
     ik: IK
     seed: int
     metrics: UserMetrics = field(default_factory=dict)
+    metric_set: MetricSet | None = None
 
     def report(self, model: MotionModel, test: MotionDataset, mode: str) -> dict[str, Any]:
         """Compute the metrics in a mode.
@@ -313,12 +323,13 @@ class Evaluation:
         torch.manual_seed(self.seed)  # each mode starts from the same seed
         clips = test.read_clips()
         rows: list[dict[str, Any]] = []
+        branches = []
         for index, motion in enumerate(predict(model, clips, mode, self.batch)):
             facts = {"name": test.names[index], "group": test.groups[index]}
             facts |= {"source": test.sources[index]} if test.sources else {}
-            errors = measure_clip(model.normalizer, motion, clips[index], self.ik, self.metrics)
-            rows.append({**facts, "frames": len(clips[index]), **errors})
-        branches = [{key: row[key] for key in errors} for row in rows]
+            scored = motion, clips[index], self.ik, self.metrics, self.metric_set
+            branches.append(measure_clip(model.normalizer, *scored))
+            rows.append({**facts, "frames": len(clips[index]), **branches[-1]})
         label = {} if model.is_stream else {"offline": True}
         mean = average_clips(branches, [row["frames"] for row in rows])
         return {"mean": mean, "clips": rows, **label}

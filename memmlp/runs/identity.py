@@ -41,6 +41,7 @@ VERSIONS: dict[str, int] = {
     "weighting.learned": 2,
     # evaluation (memmlp.evaluation)
     "metrics": 1,
+    "metric_sets": 1,
     "mode.stream": 1,
     "mode.window": 3,
     "ik.lbfgs": 1,
@@ -165,6 +166,7 @@ def find_evaluation_versions(settings: Mapping[str, Any]) -> dict[str, int]:
     """Return the versions of all components that an evaluation uses, by name."""
     solver = [f"ik.{settings['ik']}"] if settings["ik"] != "off" else []
     own = [f"metric.{name}" for name in settings.get("metrics", ())]
+    own += ["metric_sets"] if settings.get("metric_set") else []
     return find_versions(["metrics", f"mode.{settings['mode']}", *solver, *own])
 
 
@@ -188,7 +190,8 @@ def select_evaluation_settings(
     names = sorted(chosen.get("metrics") or ())
     custom = {name: collect_components().get(("metric", name)) for name in names}
     metrics = {name: f"{one.module}.{one.builds}" if one else "" for name, one in custom.items()}
-    further = {key: value for key, value in {**groups, "metrics": metrics}.items() if value}
+    further = {**groups, "metrics": metrics, "metric_set": chosen.get("metric_set")}
+    further = {key: value for key, value in further.items() if value}
     return {"mode": mode, **solver, **inference, **drawn, **further}
 
 

@@ -6,17 +6,19 @@ made the run.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.common.overrides import select_last_by_key
 from memmlp.common.text_formats import join_command
+from memmlp.evaluation.metric_facts import AUTHORS
 from memmlp.report.tables.effects import (
     RunsBySeed,
     compare_branches,
@@ -88,43 +90,61 @@ def find_imported_runs(outputs: Path) -> list[MeasuredRun]:
     return [load_measured_run(run.folder) for run in found]
 
 
+class OfficialValue(NamedTuple):
+    """A published value and those measured here, in a mode, as texts: of the authors' weights by their
+    released test (`authors`) and by this project's metrics (`imported`), and of trainings."""
+
+    variant: str
+    mode: str
+    metric: str
+    published: str
+    authors: str
+    imported: str
+    trained: str
+
+
 def list_official_values(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], imported: Sequence[MeasuredRun], modes: Sequence[str]
-) -> list[tuple[str, ...]]:
-    """Return rows that compare published values with those of imported weights and of trainings.
+) -> list[OfficialValue]:
+    """Return the values of a sweep's variants: published, of imported weights, and of trainings.
 
-    Each row has a variant's label, the weights ("published", the file of imported weights or "trained here"),
-    the mode and the metrics. Imported weights belong to a variant with the same network, refiner and data.
+    A mode without values is left out if another one has values.
     """
     rows = []
     for variant in sweep.variants:
-        chosen = select_last_by_key((*sweep.base, *sweep.command_line, *(variant.overrides or ())))
-        keys = ("model", "data", "refiner")
-        model, data, refiner = (chosen[key].value if key in chosen else None for key in keys)
-        theirs = [
-            one
-            for one in imported
-            if one.run
-            and (one.run.manifest["imported"]["model"] == model)
-            and data in (None, one.run.config["data"]["name"])
-            and (None if refiner == "null" else refiner) == (one.run.config["refiner"] or {}).get("name")
-        ]
-        trained = list(runs.get(variant.label, {}).values())
-        printed = variant.paper or {}
-        numbers = (f"{printed[m]:.2f}" if m in printed else "-" for m in sweep.metrics)
-        rows.append((variant.label, "published", "", *numbers))
-        for mode in modes:
-            for label, found in (("imported", theirs[:1]), ("trained here", trained)):
-                values = (_format_mean(found, mode, variant.branch, metric) for metric in sweep.metrics)
-                shown = found[0].origin.imported if found and label == "imported" else label
-                cells = tuple(values) if found else ("not measured",) + ("",) * (len(sweep.metrics) - 1)
-                rows.append((variant.label, str(shown), mode, *cells))
+        theirs, trained = find_official_runs(sweep, variant, imported), runs.get(variant.label, {}).values()
+        found = [mode for mode in modes if any(mode in run.means for run in (*theirs, *trained))]
+        for mode, metric in itertools.product(found or [""], sweep.metrics):
+            printed = (variant.paper or {}).get(metric)
+            published = "-" if printed is None else f"{printed:.2f}"
+            pairs = (theirs, AUTHORS), (theirs, variant.branch), (trained, variant.branch)
+            values = [_format_mean(group, mode, branch, metric) for group, branch in pairs]
+            if metric in COSTS:  # no released test measures them
+                values[0] = "-"
+            rows.append(OfficialValue(variant.label, mode, metric, published, *values))
     return rows
 
 
-def _format_mean(runs: Sequence[MeasuredRun], mode: str, branch: str, metric: str) -> str:
+def find_official_runs(sweep: Sweep, variant: Variant, imported: Sequence[MeasuredRun]) -> list[MeasuredRun]:
+    """Return the newest run of imported weights with the variant's network, refiner and data, if any."""
+    chosen = select_last_by_key((*sweep.base, *sweep.command_line, *(variant.overrides or ())))
+    keys = ("model", "data", "refiner")
+    model, data, refiner = (chosen[key].value if key in chosen else None for key in keys)
+    return [
+        one
+        for one in imported
+        if one.run
+        and (one.run.manifest["imported"]["model"] == model)
+        and data in (None, one.run.config["data"]["name"])
+        and (None if refiner == "null" else refiner) == (one.run.config["refiner"] or {}).get("name")
+    ][:1]
+
+
+def _format_mean(runs: Collection[MeasuredRun], mode: str, branch: str, metric: str) -> str:
     values = [value for run in runs if (value := run.get_value(mode, branch, metric)) is not None]
-    return f"{math.fsum(values) / len(values):.2f}" if values else "not measured"
+    if not values:
+        return "-" if runs and branch == AUTHORS else "not measured"
+    return f"{math.fsum(values) / len(values):.2f}"
 
 
 def make_table(
