@@ -38,6 +38,8 @@ def test_a_mean_over_a_part_of_the_clips_is_no_number_unless_the_others_are_too_
     assert math.isnan(average_clips(rows, [600, 4])["rotation"]["Jitter"])
     rows[1]["rotation"]["own"] = math.nan
     assert math.isnan(average_clips(rows, [600, 3])["rotation"]["own"])
+    rows[1]["authors"] = {"MPJPE": 5.0}  # a released test that leaves out the first clip
+    assert average_clips(rows, [600, 3])["authors"] == {"MPJPE": 5}
 
 
 def test_a_network_that_diverged_is_evaluated_like_any_other():

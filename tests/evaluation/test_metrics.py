@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.evaluation import metrics
 from memmlp.evaluation.ik import NoIK
+from memmlp.evaluation.metric_facts import METRIC_SETS
 from memmlp.evaluation.modes import Evaluation, predict_stream, predict_windows
 from memmlp.motion.body import MOTION_DIM
 
@@ -51,6 +52,49 @@ def test_position_metrics_are_numpys():
         "MPJVE": 100 * 60 * velocity.mean(), "Jitter": jitter, "GT Jitter": true_jitter,
     }  # fmt: skip
     assert report == pytest.approx(expected, abs=1e-5, rel=1e-5)
+
+
+DIFFERENCES = {
+    "wrapped": lambda one: (one + np.pi) % (2 * np.pi) - np.pi,
+    "plain": lambda one: one,
+    "turned": lambda one: Rotation.from_rotvec(one.reshape(-1, 3)).as_rotvec(),
+}
+ROOTLESS = [3, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21], [1, 2, 4, 5, 7, 8, 10, 11]
+RELEASED = {  # MPJRE's differences and first joint, roots in Upper and Lower PE, frames
+    "agrol": ("wrapped", 1, [], [0], slice(None)), "hmd_poser": ("wrapped", 1, [], [0], slice(None)),
+    "sage": ("turned", 1, [], [0], slice(None)), "rpm": ("wrapped", 0, None, None, slice(59, None)),
+    "avatar_poser": (None, None, None, None, slice(None)),
+    "ego_poser": ("plain", 1, None, None, slice(79, None)),
+    "avatar_jlm": ("plain", 1, [0], [], slice(None)), "bodiffusion": ("plain", 1, [], [], slice(0, 121)),
+    "manikin": (None, None, [0], [], slice(None)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", METRIC_SETS)
+def test_a_released_test_is_numpys(name: str):
+    rng, (angles, first, upper, lower, frames) = np.random.default_rng(0), RELEASED[name]
+    turned, positions = (
+        [random_rotations(rng, 130, near_pi=True) for _ in "ab"],
+        rng.normal(size=(2, 130, 22, 3)),
+    )
+    found = metrics.measure_as_released(
+        METRIC_SETS[name], tuple(map(torch.tensor, turned)), tuple(map(torch.tensor, positions))
+    )
+    difference = positions[0, frames] - positions[1, frames]
+    error, velocity = 100 * np.linalg.norm(difference, axis=-1), np.diff(difference, axis=0)
+    expected = {"MPJPE": error.mean(), "MPJVE": 6000 * np.linalg.norm(velocity, axis=-1).mean()}
+    expected |= {"Hand PE": error[:, [20, 21]].mean(), "Root PE": error[:, 0].mean()}
+    for group, root, joints in zip(("Upper PE", "Lower PE"), (upper, lower), ROOTLESS, strict=True):
+        expected[group] = error[:, [*(root or []), *joints]].mean()
+    for group, motion in zip(("Jitter", "GT Jitter"), positions, strict=True):
+        expected[group] = np.linalg.norm(np.diff(motion[frames], 3, axis=0), axis=-1).mean() * 2160
+    if angles:
+        one, other = (Rotation.from_matrix(m[frames, first:].reshape(-1, 3, 3)).as_rotvec() for m in turned)
+        expected["MPJRE"] = np.rad2deg(np.abs(DIFFERENCES[angles](one - other)).mean())
+    assert found == pytest.approx({key: expected[key] for key in METRIC_SETS[name].metrics}, rel=1e-6)
+    short = (m[:40] for m in map(torch.tensor, positions))
+    few = metrics.measure_as_released(METRIC_SETS[name], tuple(map(torch.tensor, turned)), tuple(short))
+    assert (not few) == (name in ("rpm", "ego_poser", "bodiffusion"))
 
 
 class Counter:

@@ -14,7 +14,14 @@ from memmlp.common.components import component, find_chosen_settings
 from memmlp.common.errors import InputError
 from memmlp.common.settings import at_least, one_of, positive, setting
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_POSITION
-from memmlp.motion.geometry import compute_geodesic_angle, forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.geometry import (
+    complete_columns,
+    compute_geodesic_angle,
+    convert_almost_rotations,
+    forward_kinematics,
+    matrix_to_sixd,
+    sixd_to_matrix,
+)
 from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import (
     CompleteLossSettings,
@@ -34,21 +41,28 @@ MAX_STANDING_MOVE = 0.01  # metres a frame, up to which a true foot stands
 
 class BodyMotion:
     """A body's pose at each frame of world motion (B, T, 198), of which only rotations are used, with cached
-    values that several terms need. `normalizer` provides the rest pose."""
+    values that several terms need. `normalizer` provides the rest pose; `columns` is a key of
+    TermsLossSettings."""
 
-    def __init__(self, motion: Tensor, normalizer: Normalizer):
-        self.rest = normalizer.rest
+    def __init__(self, motion: Tensor, normalizer: Normalizer, columns: str | None = None):
+        self.rest, self.columns = normalizer.rest, columns
         self.sixd = motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6))
 
     @cached_property
     def local(self) -> Tensor:
         """The local rotations (B, T, 22, 3, 3)."""
+        if self.columns == "released":
+            return convert_almost_rotations(complete_columns(self.sixd))
         return sixd_to_matrix(self.sixd)
 
     @cached_property
     def global_pose(self) -> tuple[Tensor, Tensor]:
         """Global rotations (B, T, 22, 3, 3), and positions (B, T, 22, 3) with the pelvis at the origin."""
-        return forward_kinematics(self.local, torch.zeros_like(self.local[..., ROOT, :, 0]), self.rest)
+        pelvis = torch.zeros_like(self.local[..., ROOT, :, 0])
+        rotations, positions = forward_kinematics(self.local, pelvis, self.rest)
+        if self.columns == "released":
+            rotations, _ = forward_kinematics(complete_columns(self.sixd), pelvis, self.rest)
+        return rotations, positions
 
     @cached_property
     def turns(self) -> Tensor:
@@ -72,8 +86,15 @@ class Comparison:
     54). Each weight of TermsLossSettings has a method with the same name, which returns the term. Positions
     are joints (B, T, 22, 3); the predicted ones have the head on its tracker."""
 
-    def __init__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer):
-        self.predicted, self.truth = BodyMotion(motion, normalizer), BodyMotion(truth, normalizer)
+    def __init__(
+        self,
+        motion: Tensor,
+        truth: Tensor,
+        sparse: Tensor,
+        normalizer: Normalizer,
+        columns: str | None = None,
+    ):
+        self.predicted, self.truth = BodyMotion(motion, normalizer, columns), BodyMotion(truth, normalizer)
         self.head = sparse[..., SPARSE_POSITION][..., None, :3]
         self.true_positions = joints(truth)
 
@@ -189,6 +210,9 @@ class TermsLossSettings(CompleteLossSettings):
     # initial values of e^-s
     weighting: str = setting(one_of("fixed", "learned"), "fixed")
     lr: float = setting(positive(), 1.0e-2)  # learning rate of learned weights
+    # released: predicted 6D rotations are read like the released codes of AvatarPoser, EgoPoser, HMD-Poser and
+    # AvatarJLM, without making their columns orthonormal; null: orthonormal
+    columns: str | None = setting(one_of("released"), None)
     orientation: float | None = setting(at_least(0), None)  # the root's 6D orientation
     rotation: float | None = setting(at_least(0), 1.0)  # the other joints' local 6D rotations
     global_rotation: float | None = setting(at_least(0), None)  # all joints' global 6D rotations
@@ -238,9 +262,15 @@ class TermsLoss(Loss):
     begin at 0."""
 
     def __init__(
-        self, error: str = "absolute", weighting: str = "fixed", lr: float = 1e-2, **weights: float | None
+        self,
+        error: str = "absolute",
+        weighting: str = "fixed",
+        lr: float = 1e-2,
+        columns: str | None = None,
+        **weights: float | None,
     ):
         super().__init__()
+        self.columns = columns
         chosen = {name: weight for name, weight in weights.items() if weight is not None}
         if not chosen:
             raise InputError(f"loss=terms: must have a weight for at least one of {', '.join(TERMS)}")
@@ -250,5 +280,5 @@ class TermsLoss(Loss):
         )
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        pair = Comparison(motion, truth, sparse, normalizer)
+        pair = Comparison(motion, truth, sparse, normalizer, self.columns)
         return {name: getattr(pair, name)(self.error) for name in self.weighting.weights()}
