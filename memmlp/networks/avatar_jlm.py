@@ -131,6 +131,8 @@ class AvatarJLMSettings(NetworkSettings):
     feedforward: int = setting(at_least(1), tiny=64, small=128, paper=2048)
     dropout: float = setting(fraction(), 0.1)  # dropout in the encoders during training
     coarse_weight: float = setting(at_least(0), 1.0)  # weight of the loss for the coarse pose's joints
+    # true: this loss counts tracked joints as exact, as in the released code
+    coarse_untracked: bool | None = setting(None, None)
 
     defaults: ClassVar = {"loss": "avatar_jlm"}
     recipe: ClassVar = tuned(8.0e-3)
@@ -179,6 +181,7 @@ class AvatarJLM(WindowModel):
     def __init__(self, normalizer: Normalizer, settings: AvatarJLMSettings):
         super().__init__(normalizer, settings.frames)
         self.coarse_weight, hidden = settings.coarse_weight, 2 * settings.width
+        self.coarse_untracked = settings.coarse_untracked
         self.embedding = nn.Linear(N_JOINTS * JOINT_DIM, hidden)
         self.coarse = nn.Sequential(
             nn.Linear(hidden, hidden), nn.LeakyReLU(0.1), nn.Linear(hidden, ROTATION.stop)
@@ -290,5 +293,8 @@ class AvatarJLM(WindowModel):
         coarse_joints, _ = self.place_coarse_joints(self.embedding(spread_over_joints(encoded)))
         true_positions = self.normalizer.coordinates.convert_motion_to_local(motion, origin)[..., POSITION]
         joints = true_positions.unflatten(-1, (N_JOINTS, 3))
-        error = coarse_joints - (joints - joints[..., HEAD : HEAD + 1, :])
+        joints = joints - joints[..., HEAD : HEAD + 1, :]
+        if self.coarse_untracked:
+            coarse_joints = replace_tracked(coarse_joints, joints[..., list(TRACKED), :])
+        error = coarse_joints - joints
         return {"coarse": self.coarse_weight * error.abs().mean()}

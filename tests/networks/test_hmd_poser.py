@@ -7,7 +7,7 @@ import torch
 
 from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.geometry import sixd_to_matrix
-from memmlp.networks.hmd_poser import NormedLSTM, locate_hands
+from memmlp.networks.hmd_poser import locate_hands
 
 CLIP = tiny.clip(20)
 
@@ -24,23 +24,6 @@ def test_hands_in_the_heads_frame_are_those_of_consecutive_frames():
         locate_hands(CLIP[None, :, :SPARSE_DIM]), (*expected, np.diff(place, axis=0)), strict=True
     ):
         np.testing.assert_allclose(found[0, 1:], wanted[-19:], atol=1e-5)
-
-
-@torch.no_grad()
-def test_an_lstm_is_torchs_with_weights_of_direction_and_gain():
-    ours, torchs = NormedLSTM(6).double(), torch.nn.LSTM(6, 6, batch_first=True).double()
-    for gain in ours.gains:
-        gain.mul_(1 + torch.rand_like(gain))
-    names = ("weight_ih_l0", "weight_hh_l0")
-    for name, direction, gain in zip(names, ours.directions, ours.gains, strict=True):
-        rows = [row / row.norm() * size for row, size in zip(direction, gain, strict=True)]
-        getattr(torchs, name).copy_(torch.stack(rows))
-    torchs.bias_ih_l0.copy_(ours.biases[0])
-    torchs.bias_hh_l0.copy_(ours.biases[1])
-    x, states = torch.randn(3, 5, 6).double(), torch.randn(2, 3, 6).double()
-    expected, (hidden, cell) = torchs(x, (states[:1], states[1:]))
-    for found, of in zip(ours(x, *states), (expected, hidden[0], cell[0]), strict=True):
-        torch.testing.assert_close(found, of)
 
 
 def test_the_shape_is_trained_to_be_the_same_within_a_window():

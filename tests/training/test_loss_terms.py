@@ -1,5 +1,7 @@
 """The library of loss terms, computed independently, in NumPy and joint by joint."""
 
+import itertools
+
 import numpy as np
 import pytest
 import tiny
@@ -114,6 +116,22 @@ def test_errors_are_of_components_or_of_joints_and_terms_are_weighted(bodies):
     assert float(total) == pytest.approx(2 * float(parts["rotation"]) + 0.5 * float(parts["hand"]))
     with pytest.raises(InputError, match=r"loss=terms: .*weight"):
         TermsLoss(rotation=None)
+
+
+def test_released_columns_are_not_made_orthonormal():
+    """In global rotations as they are; in positions as the rotations that are read from them."""
+    long = MADE.clone()
+    long[..., 6:12] *= 1.1  # both columns of the left hip
+    columns = [part[..., ROTATION].double().numpy().reshape(-1, 22, 2, 3) for part in (long, TRUE[..., 54:])]
+    chains = [np.concatenate([c, np.cross(c[:, :, :1], c[:, :, 1:])], 2).swapaxes(-1, -2) for c in columns]
+    for turned, joint in itertools.product(chains, range(1, 22)):
+        turned[:, joint] = turned[:, PARENTS[joint]] @ turned[:, joint]
+    expected = np.abs(chains[0][..., :2] - chains[1][..., :2]).mean()
+    assert terms(long, columns="released", global_rotation=1.0)["global_rotation"] == pytest.approx(expected)
+    usual, released = (terms(long, columns=one, world_position=1.0) for one in (None, "released"))
+    assert usual == terms(world_position=1.0) != released
+    sound = terms(columns="released", world_position=1.0)
+    assert sound == pytest.approx(terms(world_position=1.0), rel=1e-5)
 
 
 def test_every_term_reaches_the_rotations():
