@@ -32,7 +32,7 @@ MPJPE. The geodesic value is twice the MPJRE value, because true angles are abou
 
 
 class MetricSet(NamedTuple):
-    """How a repository's released test measures a clip. The defaults are AGRoL's, as in `metrics`.
+    """How a repository's released test measures a clip. The defaults are AGRoL's.
 
     Attributes:
         source: the repository and its commit.
@@ -44,6 +44,7 @@ class MetricSet(NamedTuple):
         first: number of frames that are left out at the start of a clip.
         least: number of frames in the shortest clip that is measured.
         hop: the measured frames are `least` and a multiple of `hop`; the rest of a clip is left out.
+        orthonormal: whether it makes the columns of 6D rotations orthonormal before it reads them.
     """
 
     source: str
@@ -54,6 +55,7 @@ class MetricSet(NamedTuple):
     first: int = 0
     least: int = 1
     hop: int = 1
+    orthonormal: bool = False
 
 
 _POSITIONS = ("MPJPE", "MPJVE", "Hand PE", "Upper PE", "Lower PE")
@@ -61,7 +63,7 @@ _POSITIONS = ("MPJPE", "MPJVE", "Hand PE", "Upper PE", "Lower PE")
 METRIC_SETS = {
     "agrol": MetricSet("facebookresearch/AGRoL 13a2b63"),
     "hmd_poser": MetricSet("Pico-AI-Team/HMD-Poser 7c3470d"),
-    "sage": MetricSet("Wenchao-M/SAGE 07415ac", angles="turned"),
+    "sage": MetricSet("Wenchao-M/SAGE 07415ac", angles="turned", orthonormal=True),
     "rpm": MetricSet(
         "facebookresearch/motion_rolling_prediction 64fe8f1",
         ("MPJRE", "MPJPE", "MPJVE", "Jitter", "GT Jitter"), root=True, first=59, least=63,
@@ -78,7 +80,7 @@ METRIC_SETS = {
         "BCV-Uniandes/BoDiffusion 0ffd1b8", ("MPJRE", *_POSITIONS, "Root PE"), angles="plain",
         root_in="neither", least=41, hop=20,
     ),
-    "manikin": MetricSet("eth-siplab/MANIKIN 24f4931", _POSITIONS, root_in="Upper PE"),
+    "manikin": MetricSet("eth-siplab/MANIKIN 24f4931", _POSITIONS, root_in="Upper PE", orthonormal=True),
 }  # fmt: skip
 """The options of `evaluation.metric_set`: the released test of each repository."""
 

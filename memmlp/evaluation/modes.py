@@ -33,7 +33,12 @@ from memmlp.evaluation.metric_facts import AUTHORS, MIN_FRAMES, MetricSet
 from memmlp.evaluation.metrics import UserMetrics, measure_as_released
 from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.geometry import sixd_to_matrix
+from memmlp.motion.geometry import (
+    complete_columns,
+    convert_almost_rotations,
+    matrix_to_sixd,
+    sixd_to_matrix,
+)
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 
@@ -181,8 +186,10 @@ def measure_clip(
     )
     report = {"rotation": measure_rotation_branch(normalizer, motion, truth, custom), "position": position}
     if metric_set:
-        rotations = extract_rotations(mark_invalid_rotations(motion)), extract_rotations(target)
-        placed = normalizer.compute_positions(motion, sparse), positions[1]
+        marked = mark_invalid_rotations(motion)
+        read = marked if metric_set.orthonormal else read_released_rotations(marked)
+        rotations = extract_rotations(read), extract_rotations(target)
+        placed = normalizer.compute_positions(read, sparse), positions[1]
         report |= {AUTHORS: found} if (found := measure_as_released(metric_set, rotations, placed)) else {}
     solved = (ik or NoIK()).solutions(normalizer, motion, sparse)
     return report | {
@@ -214,6 +221,14 @@ def mark_invalid_rotations(motion: Tensor) -> Tensor:
     marked = motion.clone()
     marked[:, ROTATION] = torch.where(valid, motion[:, ROTATION], math.nan)
     return marked
+
+
+def read_released_rotations(motion: Tensor) -> Tensor:
+    """Return motion (N, 198) with the rotations that released codes read from its 6D columns; only columns
+    that are not orthonormal change."""
+    columns = complete_columns(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
+    sixd = matrix_to_sixd(convert_almost_rotations(columns)).flatten(-2)
+    return torch.cat([sixd, motion[:, POSITION]], -1)
 
 
 def extract_rotations(motion: Tensor) -> Tensor:

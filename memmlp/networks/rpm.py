@@ -59,6 +59,9 @@ class RPMSettings(NetworkSettings):
     horizon: int = setting(at_least(1), 10)
     # true: the first prediction of a frame is its tanh, as in the released code; null or false: unchanged
     bounded_first: bool | None = setting(default=None)
+    # true: training windows begin with true predictions, as in the released code; null or false: without
+    # predictions, and a quarter of them without a past
+    true_start: bool | None = setting(default=None)
 
     defaults: ClassVar = {"loss": "rpm"}
     recipe: ClassVar = {"normalizer.z_scores": True, **tuned(8.0e-3)}
@@ -111,6 +114,7 @@ class RPM(WindowlessModel):
         super().__init__(normalizer, settings.frames)
         self.context, self.horizon = settings.context, settings.horizon
         self.own_dropout, self.bounded_first = settings.own_dropout, bool(settings.bounded_first)
+        self.true_start = bool(settings.true_start)
         self.motion = nn.Linear(ROTATION.stop, settings.width)
         self.sparse = nn.Linear(SPARSE_DIM, settings.width)
         self.attention = Attention(settings.width, settings.heads)
@@ -199,12 +203,16 @@ class RPM(WindowlessModel):
         begin = now - int(torch.randint(now - self.context + 1, ()))
         encoded = self.encode(sparse)
         past = slice(begin - self.context, begin)
-        motion = self.normalizer.encode(true_frames[:, past])[..., SPARSE_DIM:][..., ROTATION]
+        motion = self.normalizer.encode(true_frames)[..., SPARSE_DIM:][..., ROTATION]
         drawn = distributed.draw_rows(torch.rand_like, true_frames[:, past][:, :1, 0])
         has_past = (drawn >= FRESH_FRACTION).to(true_frames.dtype)  # the other windows start without a past
+        if self.true_start:
+            has_past = torch.ones_like(has_past)
+            predicted = motion[:, begin - 1 : begin - 1 + self.horizon]
+            state = state | {"prediction": predicted, "predicted": has_past}
         state = state | {
             "sparse": has_past[..., None] * encoded[:, past],
-            "motion": has_past[..., None] * motion,
+            "motion": has_past[..., None] * motion[:, past],
             "started": has_past,
         }
         training = self.training

@@ -98,6 +98,7 @@ class AdamWSettings(OptimSettings):
     # decay of an exponential moving average of the weights, such as 0.999; evaluation uses this average.
     # null: no average
     ema: float | None = setting(within(0, 1, strict=True), "${profile.ema}")
+    eps: float | None = setting(positive(), None)  # Adam's epsilon; null: 1e-8
 
 
 @component("optim", "muon", builds="Muon")
@@ -145,6 +146,7 @@ class Optim:
     clip_norm: float = 0.0
     precision: str = "fp32"
     compile: bool = False
+    eps: float | None = None
     checkpoint_every: int = 500
     validate_every: float = 1000
     log_every: int = 50
@@ -196,7 +198,8 @@ class Optim:
     def build_adam(self, groups: list[dict]) -> Optimizer:
         """Make Adam or AdamW for parameter groups."""
         kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
-        return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
+        keys = {"lr": self.lr, "weight_decay": self.weight_decay, "betas": self.betas}
+        return kind(groups, eps=self.eps or 1e-8, **keys, fused=True)
 
     def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
         """Return the average over steps that provides the final weights; without EMA, the last weights."""

@@ -7,6 +7,7 @@ import tiny
 import torch
 
 from memmlp.evaluation.ik import NoIK
+from memmlp.evaluation.metric_facts import METRIC_SETS
 from memmlp.evaluation.modes import Evaluation, average_clips, measure_clip, measure_stream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
@@ -26,6 +27,20 @@ def test_a_rotation_of_zeros_or_parallel_columns_is_no_rotation():
         assert math.isnan(found["rotation"]["MPJRE"])
         assert math.isnan(found["rotation"]["MPJPE"])
         assert found["position"] == sound["position"]
+
+
+def test_released_tests_read_columns_as_they_are():
+    """Long columns change nothing here, and everything in AGRoL's test, which SAGE-Net's does not share."""
+    truth, motion = tiny.clip(8), tiny.clip(8, 1)[:, SPARSE_DIM:].clone()
+    sound = measure_clip(tiny.normalizer(Heading()), motion, truth, metric_set=METRIC_SETS["agrol"])
+    names = METRIC_SETS["agrol"].metrics
+    assert sound["authors"] == pytest.approx({name: sound["rotation"][name] for name in names}, rel=1e-4)
+    motion[:, 6:12] *= 1.2
+    for name in ("agrol", "sage"):
+        found = measure_clip(tiny.normalizer(Heading()), motion, truth, metric_set=METRIC_SETS[name])
+        assert found["rotation"] == pytest.approx(sound["rotation"], rel=1e-4)
+        same = found["authors"]["Lower PE"] == pytest.approx(sound["authors"]["Lower PE"], rel=1e-3)
+        assert same == (name == "sage")
 
 
 def test_a_mean_over_a_part_of_the_clips_is_no_number_unless_the_others_are_too_short():

@@ -110,6 +110,8 @@ class RPMLossSettings(CompleteLossSettings):
     rotation_velocity: float = setting(at_least(0), 1.0)
     world_position: float = setting(at_least(0), 1.0)
     velocity: float = setting(at_least(0), 1.0)
+    # released: positions from 6D rotations whose columns are not made orthonormal; see loss=terms
+    columns: str | None = setting(one_of("released"), None)
 
 
 class RPMLoss(Loss):
@@ -119,12 +121,13 @@ class RPMLoss(Loss):
 
     def __init__(self, settings: RPMLossSettings | None = None):
         super().__init__()
-        self.weighting = FixedWeights(read_weights(settings or RPMLossSettings()))
+        settings = settings or RPMLossSettings()
+        self.columns, self.weighting = settings.columns, FixedWeights(read_weights(settings))
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         origin = normalizer.find_origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
-        rotations, pair = error[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
+        rotations, pair = error[..., ROTATION], Comparison(motion, truth, sparse, normalizer, self.columns)
         positions = (pair.positions - pair.true_positions).flatten(-2)
         return {
             "rotation_all": sum_joint_errors(rotations),

@@ -28,7 +28,7 @@ def select_joints(positions: Tensor, indices: Sequence[int]) -> Tensor:
 
 def read_weights(settings: Settings) -> dict[str, float]:
     """Return the numeric settings by name, which are the weights of a loss."""
-    return {name: value for name, value in asdict(settings).items() if not isinstance(value, str)}
+    return {name: value for name, value in asdict(settings).items() if isinstance(value, float)}
 
 
 @component("loss", "manual", builds="ManualWeights")

@@ -210,8 +210,8 @@ class TermsLossSettings(CompleteLossSettings):
     # initial values of e^-s
     weighting: str = setting(one_of("fixed", "learned"), "fixed")
     lr: float = setting(positive(), 1.0e-2)  # learning rate of learned weights
-    # released: predicted 6D rotations are read like the released codes of AvatarPoser, EgoPoser, HMD-Poser and
-    # AvatarJLM, without making their columns orthonormal; null: orthonormal
+    # released: positions and global rotations as in most released codes (docs/guides/published-weights.md),
+    # whose 6D columns are not made orthonormal; null: orthonormal
     columns: str | None = setting(one_of("released"), None)
     orientation: float | None = setting(at_least(0), None)  # the root's 6D orientation
     rotation: float | None = setting(at_least(0), 1.0)  # the other joints' local 6D rotations
