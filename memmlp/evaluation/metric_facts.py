@@ -31,6 +31,10 @@ MPJPE. The geodesic value is twice the MPJRE value, because true angles are abou
 """
 
 
+_OF_AGROL = tuple(name for name in UNITS if name != "geodesic")
+_POSITIONS = ("MPJPE", "MPJVE", "Hand PE", "Upper PE", "Lower PE")
+
+
 class MetricSet(NamedTuple):
     """How a repository's released test measures a clip. The defaults are AGRoL's.
 
@@ -48,7 +52,7 @@ class MetricSet(NamedTuple):
     """
 
     source: str
-    metrics: tuple[str, ...] = tuple(name for name in UNITS if name != "geodesic")
+    metrics: tuple[str, ...] = _OF_AGROL
     angles: str = "wrapped"
     root: bool = False
     root_in: str = "Lower PE"
@@ -57,8 +61,6 @@ class MetricSet(NamedTuple):
     hop: int = 1
     orthonormal: bool = False
 
-
-_POSITIONS = ("MPJPE", "MPJVE", "Hand PE", "Upper PE", "Lower PE")
 
 METRIC_SETS = {
     "agrol": MetricSet("facebookresearch/AGRoL 13a2b63"),

@@ -102,9 +102,9 @@ def measure_as_released(
         return {}
     kept = slice(chosen.first, frames - (frames - chosen.least) % chosen.hop)
     predicted, truth = (one[kept] for one in positions)
-    turns = [one[kept, (0 if chosen.root else 1) :] for one in rotations]
+    turned, true_turned = (one[kept, (0 if chosen.root else 1) :] for one in rotations)
     report = measure_positions(predicted, truth)
-    report["MPJRE"] = float(compare_axis_angles(*turns, chosen.angles))
+    report["MPJRE"] = float(compare_axis_angles(turned, true_turned, chosen.angles))
     for name, group in (("Upper PE", UPPER), ("Lower PE", LOWER)):
         joints = {*group} - {ROOT} | ({ROOT} if chosen.root_in == name else set())
         report[name] = float(compute_position_error(predicted, truth, tuple(joints)))

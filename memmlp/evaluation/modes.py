@@ -293,8 +293,9 @@ def average_clips(
     """
     means = {}
     for branch, values in {name: own for row in rows for name, own in row.items()}.items():
-        having = [(row[branch], number) for row, number in zip(rows, frames, strict=True) if branch in row]
-        means[branch] = {name: _average_metric(*zip(*having, strict=True), name) for name in values}
+        having = [index for index, row in enumerate(rows) if branch in row]
+        own, counts = [rows[index][branch] for index in having], [frames[index] for index in having]
+        means[branch] = {name: _average_metric(own, counts, name) for name in values}
     return means
 
 

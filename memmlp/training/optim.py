@@ -198,8 +198,8 @@ class Optim:
     def build_adam(self, groups: list[dict]) -> Optimizer:
         """Make Adam or AdamW for parameter groups."""
         kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
-        keys = {"lr": self.lr, "weight_decay": self.weight_decay, "betas": self.betas}
-        return kind(groups, eps=self.eps or 1e-8, **keys, fused=True)
+        eps = self.eps or 1e-8
+        return kind(groups, self.lr, self.betas, eps, weight_decay=self.weight_decay, fused=True)
 
     def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
         """Return the average over steps that provides the final weights; without EMA, the last weights."""
