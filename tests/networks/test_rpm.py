@@ -72,3 +72,9 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_d
         torch.testing.assert_close(first["motion"][1], true)
         assert not last["motion"].requires_grad
         motion.sum().backward()
+    model.true_start = (
+        True  # as in the released code: the frame before the first prediction, and what follows
+    )
+    model.compute_training_outputs(SPARSE, model.initial_state(2), TRUTH)
+    true = model.normalizer.encode(TRUTH)[:, 2:6, SPARSE_DIM:][..., ROTATION]
+    torch.testing.assert_close(steps[-3][1][1]["prediction"], true)

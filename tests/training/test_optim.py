@@ -86,10 +86,11 @@ def test_the_weights_that_are_validated_are_kept(name: str, averaged: bool, tmp_
 def test_muon_has_the_matrices_and_adamw_the_rest():
     matrix, row, cube = (torch.nn.Parameter(torch.rand(shape)) for shape in ((3, 4), (4,), (2, 3, 4)))
     groups = [{"params": [matrix, row]}, {"params": [cube], "lr": 0.1, "weight_decay": 0.0}]
-    optimiser = replace(OPTIMS["muon"], other_lr=0.5).build(groups)
+    optimiser = replace(OPTIMS["muon"], other_lr=0.5, eps=1e-6).build(groups)
     muon, adamw = optimiser.parts
     assert [group["params"] for group in muon.param_groups] == [[matrix]]
     assert [group["params"] for group in adamw.param_groups] == [[row], [cube]]
+    assert [group["eps"] for group in adamw.param_groups] == [1e-6, 1e-6]
     assert [group["lr"] for group in optimiser.param_groups] == [1e-2, 0.5, 0.1]
     assert [group["weight_decay"] for group in optimiser.param_groups] == [1e-4, 1e-4, 0]
 
