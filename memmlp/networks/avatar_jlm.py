@@ -208,7 +208,8 @@ class AvatarJLM(WindowModel):
         """Number the layers in order: the released code has a list for joints and a list for frames."""
 
         def rename(name: str) -> str:
-            found = re.fullmatch(r"(motion_net\.transformer\.)([ST])TB\.(\d+)\.layers\.0(\..*)", name)
+            pattern = r"(motion_net\.transformer\.)([ST])T(?:B|Eblocks)\.(\d+)\.layers\.0(\..*)"
+            found = re.fullmatch(pattern, name)  # MANIKIN-L calls them STEblocks and TTEblocks
             return f"{found[1]}layers.{2 * int(found[3]) + (found[2] == 'T')}{found[4]}" if found else name
 
         return {rename(name): tensor for name, tensor in tensors.items()}

@@ -9,7 +9,7 @@ straight limb does not keep the swivel of the previous frame.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -55,6 +55,8 @@ PREDICTED_JOINTS = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
 """The joints with predicted local rotations besides the root: trunk, shoulders and hips."""
 SWIVELS, PLACES = 2 * len(BASES), 3 * (len(ANKLES) + len(TOES))
 PREDICTED_SIZE = 6 * (1 + len(PREDICTED_JOINTS)) + SWIVELS + PLACES
+SOURCE = "eth-siplab/MANIKIN 24f4931"
+BUFFERS = ("motion_net.ident_pose", "motion_net.keep_slots")
 AUXILIARY_SIZE = 6 * (N_JOINTS - 1)  # rotations that MANIKIN-L predicts in training alone
 
 
@@ -248,7 +250,13 @@ class ManikinSSettings(AvatarPoserSettings):
     turned: bool = setting(default=True)  # true: rotate training windows to random headings
 
     defaults: ClassVar = {"loss": "manikin_s"}
-    release: ClassVar = None  # type: ignore[assignment]
+    release: ClassVar = replace(
+        AvatarPoserSettings.release,
+        source=SOURCE,
+        names=AvatarPoserSettings.release.names
+        | {"swivel.*.*": "swivel_decoder.*.*", "places.*.*": "ankle_position_decoder.*.*"},
+        unused=(*AvatarPoserSettings.release.unused, "ident_pose", "keep_slots"),
+    )
     recipe: ClassVar = tuned(2.0e-3)
 
 
@@ -329,7 +337,16 @@ class ManikinLSettings(AvatarJLMSettings):
     offline: bool = setting(default=False)
 
     defaults: ClassVar = {"loss": "manikin_l"}
-    release: ClassVar = None  # type: ignore[assignment]
+    release: ClassVar = replace(
+        AvatarJLMSettings.release,
+        source=SOURCE,
+        sizes={
+            "model.width": ("position_embedding.weight", 0),
+            "model.depth": "motion_net.transformer.STEblocks.*.layers.0.linear1.weight",
+            "model.feedforward": ("motion_net.transformer.STEblocks.0.layers.0.linear1.weight", 0),
+        },
+        unused=(*AvatarJLMSettings.release.unused, "motion_net.J_rest", "motion_net.kintree22", *BUFFERS),
+    )
     recipe: ClassVar = {"optim.lr": "${profile.lr}", "optim.warmup": 0}  # not searched
 
 

@@ -5,6 +5,7 @@ import pickle
 import struct
 import zipfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import onnx
@@ -25,6 +26,7 @@ from memmlp.motion.geometry import (
     convert_almost_rotations,
     forward_kinematics,
     matrix_to_sixd,
+    sixd_to_matrix,
 )
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
@@ -50,14 +52,15 @@ def make_encoder(depth: int) -> nn.Module:
 
 
 class Poser(nn.ModuleDict):
-    """AvatarPoser, or EgoPoser with `views`."""
+    """AvatarPoser, EgoPoser with `views`, or MANIKIN-S with other heads."""
 
-    def __init__(self, root: str, inputs: int, views: bool):
+    def __init__(self, root: str, inputs: int, views: bool, **more: int):
+        self.heads = {root: 6, "joint_rotation_decoder": 126} | more
         super().__init__({
             "linear_embedding": nn.Linear(inputs, D), "transformer_encoder": make_encoder(DEPTH),
-            root: make_mlp_head(D, 6), "joint_rotation_decoder": make_mlp_head(D, 126),
+            **{name: make_mlp_head(D, size) for name, size in self.heads.items()},
         })  # fmt: skip
-        self.root, self.views = root, views
+        self.views = views
         if views:
             self["linear_embedding_fast"] = nn.Linear(inputs, D // 2)
         else:
@@ -73,7 +76,7 @@ class Poser(nn.ModuleDict):
         else:
             x = self["linear_embedding"](x)
         h = self["transformer_encoder"](x)[:, -1]
-        return torch.cat([self[self.root](h), self["joint_rotation_decoder"](h)], -1)[:, None]
+        return torch.cat([self[name](h) for name in self.heads], -1)[:, None]
 
 
 class Mixer(nn.Module):
@@ -258,12 +261,13 @@ def group_by_tracker(x: Tensor) -> Tensor:
 
 
 class JointLevel(nn.ModuleDict):
-    """AvatarJLM; rotations of its coarse pose are those of tests/motion/test_geometry.py."""
+    """AvatarJLM; rotations of its coarse pose are those of tests/motion/test_geometry.py. Or MANIKIN-L."""
 
-    def __init__(self) -> None:
-        lists = {name: nn.ModuleList(make_encoder(1) for _ in range(DEPTH)) for name in ("STB", "TTB")}
+    def __init__(self, blocks: str = "B", size: int = 132) -> None:
+        self.sound, names = blocks != "B", (f"ST{blocks}", f"TT{blocks}")
+        lists = {name: nn.ModuleList(make_encoder(1) for _ in range(DEPTH)) for name in names}
         leaky = nn.LeakyReLU(0.1)
-        head = nn.Sequential(nn.Linear(45 * D, 2 * D), nn.GroupNorm(8, 2 * D), leaky, nn.Linear(2 * D, 132))
+        head = nn.Sequential(nn.Linear(45 * D, 2 * D), nn.GroupNorm(8, 2 * D), leaky, nn.Linear(2 * D, size))
         coarse = nn.Sequential(nn.Linear(2 * D, 2 * D), leaky, nn.Linear(2 * D, 132))
         motion = nn.ModuleDict({"transformer": nn.ModuleDict(lists), "param_regressor": head})
         motion.temp_embed = nn.Parameter(torch.randn(1, 200, 1, D))
@@ -276,7 +280,8 @@ class JointLevel(nn.ModuleDict):
         })  # fmt: skip
 
     def place_joints(self, embedded: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        columns = complete_columns(self["joint_regressor"]["regressor"](embedded).unflatten(-1, (22, 6)))
+        sixd = self["joint_regressor"]["regressor"](embedded).unflatten(-1, (22, 6))
+        columns = sixd_to_matrix(sixd) if self.sound else complete_columns(sixd)
         pelvis = torch.zeros_like(columns[..., 0, :, 0])
         turned, _ = forward_kinematics(columns, pelvis, tiny.REST.to(columns))
         _, places = forward_kinematics(convert_almost_rotations(columns), pelvis, tiny.REST.to(columns))
@@ -408,6 +413,13 @@ TRANSFORMER = {"depth": DEPTH, "heads": HEADS, "width": D, "feedforward": WIDE, 
 RELEASED = {
     "avatar_poser": (lambda: Poser("stabilizer", 54, False), {"frames": T, **TRANSFORMER}),
     "ego_poser": (lambda: Poser("global_orientation_decoder", 60, True), {"frames": T, **TRANSFORMER}),
+    "manikin_s": (
+        lambda: Poser(
+            "stabilizer", 54, False, joint_rotation_decoder=60, swivel_decoder=8, ankle_position_decoder=12
+        ),
+        {"frames": T, **TRANSFORMER},
+    ),
+    "manikin_l": (partial(JointLevel, "Eblocks", 212), {"frames": T, "heads": HEADS, "dropout": 0.1}),
     "agrol_mlp": (AGRoL, {}),
     "agrol_diffusion": (Denoiser, {"diffusion_steps": 50, "sampling_steps": 1, "sampler": "posterior"}),
     "hmd_poser": (HMD, {"frames": T, "heads": HEADS, "dropout": 0.1, "shape_weight": 0.1}),
@@ -452,10 +464,12 @@ def test_an_imported_network_computes_what_the_released_layers_compute(name: str
     model = import_tensors(name, tmp_path / "net.pth")
     noise = getattr(model, "noise", torch.zeros(1))[0]
     released.double().noise = getattr(model, "noises", noise)
-    inputs = {"avatar_poser": X, "ego_poser": X, "rpm": X[:, :1]}.get(name, X[:, -T:])
+    inputs = {"avatar_poser": X, "ego_poser": X, "manikin_s": X, "rpm": X[:, :1]}.get(name, X[:, -T:])
     expected = released(inputs)
     if name == "bodiffusion":
         computed = denoise_still_motion(model, inputs)
+    elif name.startswith("manikin"):  # what its limb solver gets
+        computed = model.predict_parts(inputs[:, -T:])
     else:
         motion, _ = model.advance(inputs, model.initial_state(1), expected.shape[1])
         computed = motion[..., :132]
@@ -562,6 +576,7 @@ FEW_HEADS, FEW_FRAMES = f"model.heads={HEADS}", f"model.frames={T}"
 OPTIONS = {
     "agrol_mlp": [], "agrol_diffusion": [], "hmd_poser": [FEW_HEADS], "rpm": [FEW_HEADS],
     "avatar_poser": [FEW_HEADS, FEW_FRAMES], "ego_poser": [FEW_HEADS, FEW_FRAMES],
+    "manikin_s": [FEW_HEADS, FEW_FRAMES], "manikin_l": [FEW_HEADS, FEW_FRAMES],
     "avatar_jlm": [FEW_HEADS, FEW_FRAMES], "sage": SAGE, REFINED: [*SAGE, "--refiner", "refiner.pth.tar"],
     "bodiffusion": [FEW_HEADS, "model.sampling_steps=2", "model.offline=false", "export.graph=auto"],
 }  # fmt: skip
