@@ -41,7 +41,6 @@ VERSIONS: dict[str, int] = {
     "weighting.learned": 2,
     # evaluation (memmlp.evaluation)
     "metrics": 1,
-    "metric_sets": 1,
     "mode.stream": 1,
     "mode.window": 3,
     "ik.lbfgs": 1,
@@ -166,7 +165,6 @@ def find_evaluation_versions(settings: Mapping[str, Any]) -> dict[str, int]:
     """Return the versions of all components that an evaluation uses, by name."""
     solver = [f"ik.{settings['ik']}"] if settings["ik"] != "off" else []
     own = [f"metric.{name}" for name in settings.get("metrics", ())]
-    own += ["metric_sets"] if settings.get("metric_set") else []
     return find_versions(["metrics", f"mode.{settings['mode']}", *solver, *own])
 
 
