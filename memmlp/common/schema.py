@@ -72,11 +72,18 @@ def _get_fields(kind: Any) -> dict[str, Any]:
     return get_type_hints(kind, include_extras=True)
 
 
+@functools.cache
+def _get_parts(kind: Any) -> tuple[Any, tuple[Any, ...], tuple[Any, ...]]:
+    """Return a type's origin and arguments, and the classes whose values need no further check."""
+    origin, args = get_origin(kind), get_args(kind)
+    return origin, args, args if origin in (Union, UnionType) else (kind,)
+
+
 def check_type(value: Any, kind: Any, key: str = "") -> None:
     """Raise ValueError if the value of a dotted key does not have a type: a scalar, list[X], dict[str, X], X
     | Y, Literal, TypedDict, Any, or Annotated[X, PREDICATE]."""
-    origin, args = get_origin(kind), get_args(kind)
-    if type(value) is kind or (origin in (Union, UnionType) and type(value) in args):
+    origin, args, plain = _get_parts(kind)
+    if type(value) in plain:
         return
     if origin in (Union, UnionType):
         others = [one for one in args if one is not NoneType]
@@ -103,8 +110,9 @@ def check_type(value: Any, kind: Any, key: str = "") -> None:
     elif origin in (dict, list):
         _check_class(value, origin, key)
         items: Any = value.items() if origin is dict else enumerate(value)
+        plain = _get_parts(args[-1])[2]
         for name, item in items:
-            if type(item) is not args[-1]:
+            if type(item) not in plain:
                 check_type(item, args[-1], f"{key}.{name}".lstrip("."))
         for name in value if origin is dict and args[0] is not str else ():
             check_type(name, args[0], key)

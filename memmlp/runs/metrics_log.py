@@ -15,7 +15,7 @@ from memmlp.common.lease import check_owner
 from memmlp.runs.records import parse_log_entry
 
 MAX_BYTES = 64 * 2**20
-TAIL_BYTES = 2**14  # searched for recent records
+TAIL_BYTES = 2**12  # searched for recent records
 
 
 class LogRecord(NamedTuple):
@@ -35,10 +35,17 @@ def parse_record(line: bytes) -> LogRecord:
     return LogRecord(entry["step"], entry["phase"], values, entry["time"])
 
 
+@functools.lru_cache(16)
+def _read_tail(path: Path, *stamp: int) -> tuple[LogRecord, ...]:
+    log = MetricsLog(path)
+    content = log.read_bytes(-TAIL_BYTES)
+    return tuple(log.parse(content.partition(b"\n")[2] if len(content) == TAIL_BYTES else content))
+
+
 @functools.lru_cache(20_000)
 def _find_damage(path: Path, *stamp: int) -> str | None:
     try:
-        MetricsLog(path).read_tail()
+        _read_tail(path, *stamp)
     except InputError as error:
         return str(error)
     return None
@@ -77,20 +84,23 @@ class MetricsLog:
     def read(self) -> list[LogRecord]:
         """Return all records, without an incomplete last line. If a resumed run repeated a step, the step's
         last record is returned. Raises InputError if a line is damaged; the message names file and line."""
-        return list({(one.phase, one.step): one for one in self._parse(self.read_bytes())}.values())
+        return list({(one.phase, one.step): one for one in self.parse(self.read_bytes())}.values())
 
     def read_tail(self) -> list[LogRecord]:
         """Return the records in the last TAIL_BYTES. Raises InputError like `read`."""
-        content = self.read_bytes(-TAIL_BYTES)
-        return self._parse(content.partition(b"\n")[2] if len(content) == TAIL_BYTES else content)
+        return list(_read_tail(self.path, *self._stamp))
 
     def find_damage(self) -> str | None:
         """Return the error of `read_tail` as text, or None. An unchanged log is not read again."""
+        return _find_damage(self.path, *self._stamp)
+
+    @property
+    def _stamp(self) -> tuple[int, ...]:
         try:
             found = self.path.stat()
         except OSError:
-            return None
-        return _find_damage(self.path, found.st_mtime_ns, found.st_size)
+            return ()
+        return found.st_mtime_ns, found.st_size
 
     def read_bytes(self, start: int = 0) -> bytes:
         """Return the log's content from a byte on, or the last bytes if `start` is negative. Raises
@@ -103,7 +113,8 @@ class MetricsLog:
             file.seek(max(size + start, 0) if start < 0 else start)
             return file.read(MAX_BYTES)
 
-    def _parse(self, content: bytes) -> list[LogRecord]:
+    def parse(self, content: bytes) -> list[LogRecord]:
+        """Return the records in complete lines. Raises InputError like `read`."""
         found = []
         for number, line in enumerate(content.split(b"\n")[:-1], 1):
             try:

@@ -211,6 +211,11 @@ class Run:
         return "trained" if word == "running" else word  # a process holds the run without working on a stage
 
     @property
+    def is_held(self) -> bool | None:
+        """Whether a process works on the run; False if it died, None if none did (`Lock.is_held`)."""
+        return self._lock.is_held
+
+    @property
     def activity(self) -> str | None:
         """The current activity: training, evaluating or exporting; None if no process works on the run."""
         if not self._lock.is_held:

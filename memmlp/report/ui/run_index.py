@@ -4,6 +4,8 @@ import contextlib
 import hashlib
 import math
 import os
+import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -43,36 +45,74 @@ FILES = (
     "config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "STOP", "results.json", "notes.json",
 )  # fmt: skip
 STAGES_AFTER = ("evaluate", "export")  # the recorded times of the stages after training
+QUIET_LOOKS = 200  # runs without a process that are looked at in a refresh
+SETTLED = 3 * 10**9  # nanoseconds after which a folder's modification time shows any later change
 RECENT_ENTRIES = 5  # number of training entries for the estimate of a run's speed
 
 
 class RunIndex:
     """The facts of all runs.
 
+    A folder that no process works on is looked at when its modification time changes, and otherwise in
+    turns, because a lab has thousands of runs.
+
     Attributes:
         outputs: the folder of runs and caches.
         runs: the facts by run id (`read_facts`), with the run's `status`, and a `signature` that changes with
             the run's files.
+        unread: the number of runs that are not read yet.
+        reads: how often the facts of a run were read or removed, except new entries of a log.
     """
 
     def __init__(self, outputs: Path):
         self.outputs = outputs
         self.runs: dict[str, dict[str, Any]] = {}
+        self.unread = self.reads = self._turn = 0
 
-    def refresh(self) -> str:
-        """Read changed run folders, and return a text that changes when any run changes."""
-        try:
-            folders = [entry for entry in (self.outputs / "runs").iterdir() if ID.fullmatch(entry.name)]
-        except (FileNotFoundError, NotADirectoryError):
-            folders = []
-        self.runs = {folder.name: self._read_run(folder) for folder in folders if folder.is_dir()}
-        return repr([(run_id, facts["signature"], facts["status"]) for run_id, facts in self.runs.items()])
+    def refresh(self, seconds: float = math.inf) -> str:
+        """Read changed run folders, new ones for some seconds at most, and return a text that changes when
+        any run changes."""
+        end, now, found = time.monotonic() + seconds, time.time_ns(), dict[str, dict[str, Any]]()
+        folders = sorted(_list_folders(self.outputs / "runs"), key=lambda one: (-one[1], one[0]))
+        rounds, self._turn = math.ceil(len(folders) / QUIET_LOOKS), self._turn + 1
+        for number, (name, changed) in enumerate(folders):
+            facts = self.runs.get(name)
+            if facts is None and time.monotonic() > end:
+                continue
+            is_quiet = facts and facts["quiet"] == changed and number % rounds != self._turn % rounds
+            found[name] = facts if is_quiet and facts else self._read_run(self.outputs / "runs" / name)
+            found[name]["quiet"] = changed if found[name].pop("free", True) and changed < now - SETTLED else 0
+        self.reads += len(self.runs.keys() - found.keys())
+        self.unread, self.runs = len(folders) - len(found), found
+        return repr([(name, facts["signature"], facts["status"]) for name, facts in sorted(found.items())])
 
     def _read_run(self, folder: Path) -> dict[str, Any]:
-        signature, facts = _make_signature(folder), self.runs.get(folder.name)
-        if facts is None or facts["signature"] != signature:
-            facts = read_facts(folder) | {"signature": signature}
-        return {**facts, "status": Run(folder).status}
+        run, before = Run(folder), self.runs.get(folder.name)
+        stats = _stat_files(folder, FILES) + _stat_files(folder / "evaluations")
+        with contextlib.suppress(OSError):
+            for name in os.listdir(folder / "deployments"):
+                stats += _stat_files(folder / "deployments" / name, ("latency.json",))
+        log = [stat for stat in stats if stat[1] == run.metrics_path.name]
+        record = _digest(sorted(set(stats) - set(log)))
+        signature = f"{record}-{_digest(log)}"
+        if before is None or before["signature"] != signature:
+            if before and before["record"] == record and not run.damage:
+                facts = {**before, "recent": _list_recent_entries(run)}
+            else:
+                facts, self.reads = read_facts(folder), self.reads + 1
+            before = facts | {"signature": signature, "record": record, "statuses": {}}
+        held, statuses = run.is_held, before["statuses"]
+        if held not in statuses:
+            statuses[held] = run.status
+        return {**before, "status": statuses[held], "free": held is None}
+
+
+def _list_folders(folder: Path) -> list[tuple[str, int]]:
+    """Return name and modification time, nanoseconds, of each run's folder."""
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
+        runs = [one for one in entries if ID.fullmatch(one.name) and one.is_dir()]
+        return [(one.name, one.stat().st_mtime_ns) for one in runs]
+    return []
 
 
 def read_facts(folder: Path) -> dict[str, Any]:
@@ -146,7 +186,7 @@ def read_config(run: Run) -> dict[str, Any]:
 def select_listed_values(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return a config's listed values by dotted key."""
     return {
-        key: value
+        sys.intern(key): sys.intern(value) if isinstance(value, str) else value  # equal in most runs
         for key, value in make_json_safe(flatten(config)).items()
         if key.split(".")[0] not in HIDDEN_GROUPS and not key.endswith(("._target_", "._partial_"))
     }
@@ -176,19 +216,14 @@ def _read_metrics(run: Run, config: Mapping[str, Any]) -> dict[str, float | str]
     found |= flatten(records.read(run.results_path, records.Tree), "vqvae.")
     numbers = {key: to_number(value) for key, value in found.items()}
     return {
-        key: value if math.isfinite(value) else str(value)
+        sys.intern(key): value if math.isfinite(value) else str(value)
         for key, value in numbers.items()
         if isinstance(value, int | float) and not isinstance(value, bool)
     }
 
 
-def _make_signature(folder: Path) -> str:
-    """Return a text that changes when a file with facts of the run changes."""
-    stats = _stat_files(folder, FILES) + _stat_files(folder / "evaluations")
-    with contextlib.suppress(OSError):
-        for name in os.listdir(folder / "deployments"):
-            stats += _stat_files(folder / "deployments" / name, ("latency.json",))
-    return hashlib.sha256(repr(sorted(stats)).encode()).hexdigest()[:20]
+def _digest(stats: list[tuple[str, str, int, int]]) -> str:
+    return hashlib.sha256(repr(stats).encode()).hexdigest()[:16]
 
 
 def _stat_files(folder: Path, names: tuple[str, ...] | None = None) -> list[tuple[str, str, int, int]]:

@@ -1,6 +1,7 @@
 """The server's answers about runs: rows of the run table, a run's page, and curves."""
 
 import math
+import secrets
 import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -43,31 +44,76 @@ Places = Mapping[str, Sequence[Mapping[str, Any]]]
 """The sweeps and searches that use a run, by run id."""
 
 
-def list_rows(index: RunIndex, places: Places) -> dict[str, Any]:
-    """Return a row for each run. `keys` and `metrics` are the column names of `config` and `metrics`."""
-    runs = index.runs
-    keys = find_differing_keys(runs.values())
-    metrics = list(dict.fromkeys(metric for run in runs.values() for metric in run["metrics"]))
-    minor = [name for name in NEUTRAL if name != "data"]
-    later = [run["after"] for run in runs.values() if run["after"] and run["kind"] == NETWORK]
-    return {
-        "preparing": list_preparations(index.outputs),
-        "after": statistics.median(later) if later else None,  # seconds after training
-        "keys": keys,
-        "minor": [key for key in keys if any(key == name or key.startswith(f"{name}.") for name in minor)],
-        "paths": list(filter(is_data_path, keys)),
-        "metrics": metrics,
-        "units": describe_units(metrics),
-        "rows": [
-            {
-                **{key: run[key] for key in ROW_FACTS},
-                "places": list(places.get(run_id, [])),
-                "config": [run["config"].get(key) for key in keys],
-                "metrics": [_round_value(run["metrics"].get(metric), 6) for metric in metrics],
-            }
-            for run_id, run in runs.items()
-        ],
-    }
+class Rows:
+    """The rows of the run table. An answer has only the rows that changed since an earlier answer.
+
+    `keys` and `metrics` of an answer are the column names of the rows' `config` and `metrics`.
+    """
+
+    def __init__(self, index: RunIndex):
+        self.index = index
+        self.first, self.number, self.reads = secrets.token_hex(4), 0, -1
+        self.columns: dict[str, Any] = {}
+        self.stamps: dict[str, tuple[Any, int]] = {}
+        self.preparing: list[Any] = []
+        self.changed = 0
+
+    def update(self, places: Places) -> str:
+        """Compare the runs with those of the last call, and return the state of the table."""
+        runs, number, before = self.index.runs, self.number + 1, self.stamps
+        self.stamps = {}
+        for run_id, run in runs.items():
+            stamp = run["signature"], run["status"], places.get(run_id)
+            old = before.get(run_id)
+            self.stamps[run_id] = old if old and old[0] == stamp else (stamp, number)
+        preparing = list_preparations(self.index.outputs)
+        columns = self._list_columns() if self.reads != self.index.reads else self.columns
+        if columns != self.columns or before.keys() - runs.keys():
+            self.columns, self.changed = columns, number
+        news = self.changed == number or any(since == number for _, since in self.stamps.values())
+        if news or preparing != self.preparing:
+            self.number = number
+        self.reads, self.preparing = self.index.reads, preparing
+        return f"{self.first}-{self.number}"
+
+    def _list_columns(self) -> dict[str, Any]:
+        runs = self.index.runs
+        keys = find_differing_keys(runs.values())
+        metrics = list(dict.fromkeys(metric for run in runs.values() for metric in run["metrics"]))
+        minor = [name for name in NEUTRAL if name != "data"]
+        later = [run["after"] for run in runs.values() if run["after"] and run["kind"] == NETWORK]
+        return {
+            "after": statistics.median(later) if later else None,  # seconds after training
+            "keys": keys,
+            "minor": [
+                key for key in keys if any(key == name or key.startswith(f"{name}.") for name in minor)
+            ],
+            "paths": list(filter(is_data_path, keys)),
+            "metrics": metrics,
+            "units": describe_units(metrics),
+        }
+
+    def list_since(self, state: str, places: Places) -> dict[str, Any]:
+        """Return the rows that changed since a state; all rows for another state, then with `all`."""
+        first, _, number = state.partition("-")
+        since = int(number) if first == self.first and number.isdigit() else -1
+        everything = since < self.changed
+        rows = [
+            self._describe(run_id, places)
+            for run_id, (_, changed) in self.stamps.items()
+            if everything or changed > since
+        ]
+        about = {"unread": self.index.unread, "preparing": self.preparing, "all": everything, "rows": rows}
+        return about | (self.columns if everything else {})
+
+    def _describe(self, run_id: str, places: Places) -> dict[str, Any]:
+        run = self.index.runs[run_id]
+        return {
+            **{key: run[key] for key in ROW_FACTS},
+            "places": list(places.get(run_id, [])),
+            "config": [run["config"].get(key) for key in self.columns["keys"]],
+            "metrics": [_round_value(run["metrics"].get(metric), 6) for metric in self.columns["metrics"]],
+        }
 
 
 def find_differing_keys(runs: Iterable[Mapping[str, Any]]) -> list[str]:

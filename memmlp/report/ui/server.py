@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import math
 import os
 import re
 import secrets
@@ -32,7 +33,7 @@ from memmlp.common.page_server import (
 from memmlp.common.schema import check_type
 from memmlp.report.ui import runs
 from memmlp.report.ui.replay import Predict, Replays, describe_body
-from memmlp.report.ui.run_index import RunIndex, list_preparations
+from memmlp.report.ui.run_index import RunIndex
 from memmlp.report.ui.searches import Searches
 from memmlp.report.ui.sweeps import Sweeps
 from memmlp.runs.garbage_runs import delete_run, list_dependents
@@ -42,6 +43,8 @@ from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
 VIEWS = "views.json"  # the saved views in the outputs folder
+READ_SECONDS = 0.8  # for new runs before an answer
+MAX_PAUSE = 10.0  # seconds between two scans
 MAX_CURVES = 60  # maximum number of runs in an answer with curves
 
 
@@ -74,23 +77,25 @@ class Answers:
         self.outputs, self.pause, self.make_command = outputs, pause, make_command
         self.index = RunIndex(outputs)
         self.sweeps, self.searches = Sweeps(self.index), Searches(outputs)
-        self.replays = Replays(outputs, predict)
+        self.replays, self.rows = Replays(outputs, predict), runs.Rows(self.index)
         self.lock = threading.Lock()
         self.state, self.next_look = "", 0.0
+        self.places: runs.Places = {}
 
-    def refresh(self) -> str:
+    def refresh(self, seconds: float = math.inf) -> str:
         """Scan the folder, and return a text that changes when any run, sweep or search changes.
 
-        Scans take at most a tenth of the time, however many pages are open.
+        Scans take at most a fifteenth of a core, however many pages are open. New runs are read for some
+        `seconds`; the next call reads the others.
         """
         with self.lock:
-            started = time.monotonic()
-            if started >= self.next_look:
-                preparing = list_preparations(self.outputs)
-                stamps = self.index.refresh(), self.sweeps.refresh(), self.searches.make_stamp(), preparing
-                self.state = digest(stamps)[:16]
-                ended = time.monotonic()
-                self.next_look = ended + max(self.pause, 9 * (ended - started))
+            started = time.thread_time()
+            if time.monotonic() >= self.next_look or (self.index.unread and seconds == math.inf):
+                stamps = self.index.refresh(seconds), self.sweeps.refresh(), self.searches.make_stamp()
+                self.places = self.list_places()
+                self.state = f"{self.rows.update(self.places)}-{digest(stamps[1:])[:8]}"
+                pause = min(max(self.pause, 15 * (time.thread_time() - started)), MAX_PAUSE)
+                self.next_look = 0.0 if self.index.unread else time.monotonic() + pause
             return self.state
 
     def list_places(self) -> dict[str, list[dict[str, Any]]]:
@@ -111,13 +116,14 @@ class Answers:
             KeyError: if the path is unknown.
             ValueError: if the query has an invalid value.
         """
-        state = self.refresh()
         kind, _, name = path.partition("/")
+        state = self.refresh(READ_SECONDS if kind == "runs" else math.inf)
         match kind, bool(name):
             case "runs", False:
                 if query.get("state") == state:
                     return {"state": state}
-                rows = runs.list_rows(self.index, self.list_places())
+                with self.lock:
+                    rows = self.rows.list_since(query.get("state", ""), self.places)
                 outputs = str(self.outputs.absolute())
                 return {**rows, "state": state, "outputs": outputs, "writable": self.is_writable}
             case "curves", False:
@@ -139,7 +145,7 @@ class Answers:
             case (("run" | "replay"), True) if ID.fullmatch(name) and name in self.index.runs:
                 if kind == "replay":
                     return self._get_replay(name, query)
-                return runs.describe_run(self.index, name, self.sweeps.find_control(name), self.list_places())
+                return runs.describe_run(self.index, name, self.sweeps.find_control(name), self.places)
         raise KeyError(path)
 
     @property

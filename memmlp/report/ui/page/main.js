@@ -1,7 +1,7 @@
 // From the address to a page, and the bar above all pages.
 
 import { h, replace, link, empty, say } from './dom.js';
-import { follow, inFile, load, place } from './store.js';
+import { about, follow, inFile, load, place } from './store.js';
 import * as runs from './runs.js';
 import * as run from './run.js';
 import * as sweeps from './sweeps.js';
@@ -53,6 +53,6 @@ await load().catch(error => replace(content, empty('The runs cannot be shown.', 
 await show();
 document.documentElement.dataset.ready = '';
 follow((connected, changed) => {
-  showStatus(...(connected ? ['live', 'live'] : ['not connected', 'gone']));
+  showStatus(...(!connected ? ['not connected', 'gone'] : about.unread ? [`reading ${about.unread} more runs`] : ['live', 'live']));
   if (changed) current?.update?.();
 });

@@ -11,8 +11,9 @@ import { now, status } from './now.js';
 import { FINISHED, state, STATES, STATE_WORDS } from './state.js';
 import { ago, bestOf, better, columnWords, date, duration, DASH, metricNumber, metricText, metricWords, number, shortKeys, word } from './format.js';
 
-const STEP = 150; // rows that are drawn at once
+const STEP = 100; // rows that are drawn at once
 const VIEW = ['filter', 'sort', 'by', 'cols', 'base', 'x', 'y']; // what a saved view keeps
+const ORDER = new Intl.Collator(undefined, { numeric: true });
 const KEYS = 6; // config columns that are shown by default
 const METRICS = ['stream.rotation.MPJPE', 'stream.rotation.MPJRE', 'stream.rotation.MPJVE', 'stream.rotation.Jitter', 'latency.median_ms'];
 const NARROW = matchMedia('(max-width: 640px)'); // errors come before keys on a narrow screen
@@ -249,11 +250,10 @@ function sorted(list, sort) {
   const name = down ? sort.slice(1) : sort;
   const of = run => (name in run && typeof run[name] !== 'object' ? run[name] : run.config[name] ?? run.metrics[name]);
   const missing = value => value === null || value === undefined || value === '';
-  return [...list].sort((one, other) => {
-    const [a, b] = [of(one), of(other)];
+  return list.map(run => [of(run), run]).sort(([a, one], [b, other]) => {
     const byId = one.id < other.id ? -1 : 1;
     if (missing(a) || missing(b)) return Number(missing(a)) - Number(missing(b)) || byId;
-    const order = typeof a === 'number' && typeof b === 'number' ? a - b : String(a).localeCompare(String(b), undefined, { numeric: true });
+    const order = typeof a === 'number' && typeof b === 'number' ? a - b : ORDER.compare(a, b);
     return (down ? -order : order) || byId;
-  });
+  }).map(([, run]) => run);
 }

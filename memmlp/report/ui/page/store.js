@@ -8,7 +8,7 @@ export const inFile = answers !== null; // the page is a file without a server
 export const generated = answers?.about ?? '';
 
 export const runs = new Map();
-export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', state: '', preparing: [], after: null, writable: false };
+export const about = { unread: 0, keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', state: '', preparing: [], after: null, writable: false };
 const PAUSE = 1000; // milliseconds between two questions for changes
 let dataNames = new Map();
 let ambiguous = new Set(); // names of runs on several data sets
@@ -34,10 +34,10 @@ export async function curvesOf(ids) {
 
 // Read the runs again; return whether anything has changed.
 export async function load() {
-  const { rows, ...rest } = await ask(inFile ? 'runs' : `runs?state=${about.state}`);
+  const { rows, all, ...rest } = await ask(inFile ? 'runs' : `runs?state=${about.state}`);
   if (!rows) return false;
   Object.assign(about, rest);
-  runs.clear();
+  if (all) runs.clear();
   for (const row of rows) runs.set(row.id, readable(row));
   // A VQ-VAE's config does not name its data; that of a network on the same data does.
   dataNames = new Map([...runs.values()].filter(run => run.data && run.data_name).map(run => [run.data, `${run.data_name} ${run.data}`]));
@@ -71,7 +71,7 @@ function readable(row) {
 export async function follow(update) {
   while (!inFile) {
     await load().then(changed => update(true, changed), () => update(false, false));
-    await new Promise(done => setTimeout(done, PAUSE));
+    await new Promise(done => setTimeout(done, about.unread ? 0 : PAUSE));
   }
 }
 
