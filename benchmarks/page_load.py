@@ -109,7 +109,7 @@ def time_page(url: str) -> dict[str, float]:
     actions = {
         "filter": ("f = document.querySelector('#filter'); f.value = 'memory=gru seed<50'; "
                    "f.dispatchEvent(new Event('input'))",
-                   "f = document.querySelector('#filter'); f.value = ''; f.dispatchEvent(new Event('input'))"),
+                   "f.value = ''; f.dispatchEvent(new Event('input'))"),
         "group": ("choose('memory.name')", "choose('')"),
         "sort": ("document.querySelector('.runs thead th:nth-child(2) button').click()",) * 2,
     }  # fmt: skip

@@ -98,6 +98,33 @@ def build_import_variables() -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(given), "PYTHONSAFEPATH": "1"}
 
 
+class UsageTimer:
+    """Measures CPU time and memory of this process, at most every INTERVAL seconds."""
+
+    INTERVAL = 10.0
+
+    def __init__(self) -> None:
+        self._start, self._busy = time.monotonic(), time.process_time()
+
+    def read(self) -> dict[str, float]:
+        """Return the busy cores since the last result and the memory in GB; empty if it is too early."""
+        now, busy = time.monotonic(), time.process_time()
+        if now - self._start < self.INTERVAL:
+            return {}
+        cores = (busy - self._busy) / (now - self._start)
+        self._start, self._busy = now, busy
+        return {"CPU [cores]": round(cores, 2), "memory [GB]": round(_read_memory() / 1e9, 3)}
+
+
+def _read_memory() -> int:
+    """Return the memory of this process, bytes; its largest so far without /proc."""
+    with contextlib.suppress(OSError):
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
 class CoreUsageTimer:
     """Measures the fraction of time in which the calling thread ran on a CPU core. Use it only where this
     thread does all the work, such as in a single-threaded session of ONNX Runtime."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
@@ -17,6 +19,7 @@ T = TypeVar("T")
 INTERVAL = 30.0  # seconds between two progress lines
 
 _label: ContextVar[str] = ContextVar("label of the larger work", default="")
+_file: ContextVar[Path | None] = ContextVar("file of the lines about work", default=None)
 _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener to lines about work", default=None)
 
 
@@ -47,14 +50,27 @@ def send_announcements_to(
     return _set(_listener, listener)
 
 
+def keep_announcements(path: Path) -> AbstractContextManager[None]:
+    """Append announcements and progress lines of the context to a file, too, with the time."""
+    return _set(_file, path)
+
+
+def _keep(line: str) -> None:
+    if path := _file.get():
+        with contextlib.suppress(OSError), open(path, "a", encoding="utf-8") as file:
+            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n")
+
+
 def announce(line: str) -> None:
     """Send a line, such as the name of the next step, to the listener of `send_announcements_to`."""
+    _keep(line)
     if listener := _listener.get():
         listener(line)
 
 
 def notify(line: str) -> None:
     """Send a line that the user should see, such as skipped files; unlike `announce`, also on a terminal."""
+    _keep(line)
     if listener := _listener.get():
         (print_to_stderr if listener is print_unless_terminal else listener)(line)
 

@@ -27,7 +27,7 @@ MAX_FILES = 1000
 MAX_SIZE = 4 * 10**9  # default limit for the total size of all files, bytes
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 PART = r"\w[\w.-]{0,99}"  # a folder or file name; not ".."
-PATTERNS = {*Run.FILES, "notes.json", "DONE"} - {"FAILED", "STOP"}
+PATTERNS = {*Run.FILES, "notes.json", "DONE"} - {"FAILED", "STOP", "PRIORITY"}
 ALLOWED = re.compile("|".join(re.escape(pattern).replace(r"\*", PART) for pattern in sorted(PATTERNS)))
 """The files that an archive may contain."""
 

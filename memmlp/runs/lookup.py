@@ -167,7 +167,7 @@ def _write_notes(run: Run, notes: Notes) -> Notes:
     return notes
 
 
-ACTIONS = ("stop", "retry", "archive", "restore", "name", "note", "tags")
+ACTIONS = ("stop", "retry", "prioritize", "unprioritize", "archive", "restore", "name", "note", "tags")
 """The changes of a run that the command line and the page make (`change_run`)."""
 
 
@@ -187,6 +187,8 @@ def change_run(run: Run, action: str, value: str = "", by: str = "command line")
             run.request_stop()
         case "retry":
             run.retry()
+        case "prioritize" | "unprioritize":
+            run.prioritize(action == "prioritize")
         case "archive" | "restore":
             _write_notes(run, replace(read_notes(run), archived=action == "archive"))
         case "name":

@@ -19,8 +19,8 @@ TAIL_BYTES = 2**12  # searched for recent records
 
 
 class LogRecord(NamedTuple):
-    """One record of the log, after `step` finished training steps. `phase` is "train" or "val"; `time` is
-    seconds since 1970, UTC."""
+    """One record of the log, after `step` finished training steps. `phase` is "train", "val" or "system"
+    (CPU and memory); `time` is seconds since 1970, UTC."""
 
     step: int
     phase: str

@@ -77,8 +77,10 @@ class Run:
         "results.json",
         "metrics.jsonl",
         "poses.png",
+        "log.txt",
         "FAILED",
         "STOP",
+        "PRIORITY",
         "code.patch",
         "config.yaml",
         "manifest.json",
@@ -99,6 +101,8 @@ class Run:
         self.deployments = self.folder / "deployments"
         self.marker = self.folder / "DONE"
         self.stop_path = self.folder / "STOP"
+        self.priority_path = self.folder / "PRIORITY"
+        self.log_path = self.folder / "log.txt"
         self._lock, self._log = Lock(self.folder), MetricsLog(self.metrics_path)
 
     @classmethod
@@ -297,6 +301,18 @@ class Run:
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.stop_path, {"when": now()})
 
+    @property
+    def is_prioritized(self) -> bool:
+        """Whether workers take the run before other runs of their plan."""
+        return self.priority_path.exists()
+
+    def prioritize(self, wanted: bool = True) -> None:
+        """Ask workers to take the run before other runs, or no longer."""
+        if not wanted:
+            return self.priority_path.unlink(missing_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(self.priority_path, {"when": now()})
+
     def check_not_stopped(self) -> None:
         """Raise RunStopped if somebody asked for the end of the run's work."""
         if self.is_stop_requested:
@@ -414,7 +430,7 @@ class Run:
     @property
     def step(self) -> int:
         """The last logged training step; 0 before the first."""
-        return max((entry.step for entry in self.metrics()), default=0)
+        return max((entry.step for entry in self.metrics() if entry.phase != "system"), default=0)
 
     @property
     def kept_validation(self) -> LogRecord | None:

@@ -136,14 +136,20 @@ class Plan:
         return found
 
     def list_remaining(self, states: Mapping[str, str] | None = None) -> list[RunTask]:
-        """Return all tasks except tasks that are done, failed, blocked or cancelled.
+        """Return all tasks except tasks that are done, failed, blocked or cancelled; prioritized runs and
+        their prerequisites come first.
 
         Args:
             states: the tasks' states; by default, they are read from the run folders.
         """
         states = self.read_states() if states is None else states
         ended = ("done", *FAULTY)
-        return [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
+        left = [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
+        first = {task.id for task in left if self.get_run(task).is_prioritized}
+        for task in reversed(left):  # prerequisites come before the tasks that need them
+            if task.id in first and task.prerequisite:
+                first.add(task.prerequisite)
+        return sorted(left, key=lambda task: task.id not in first)
 
     def save(self, path: Path) -> None:
         """Write the plan to a file atomically."""

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, RunStopped, TrainingDiverged
+from memmlp.common.processes import UsageTimer
 from memmlp.common.progress import ProgressCounter, announce, label_progress, notify, show_progress
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
@@ -98,13 +99,15 @@ def train(
     if start and distributed.is_first():
         notify(f"{description}: resumes from the last checkpoint, at step {start} of {settings.steps}")
     distributed.copy_from_first(task.module)
-    first = distributed.is_first()
+    first, usage = distributed.is_first(), UsageTimer()
     with show_progress(description, settings.steps, start, shown=first, unit="steps") as count:
         for step in range(start, settings.steps):
             seed_step(seed, step)
             result = train_step(task, settings, optimiser, step)
             average.update(step + 1)
             validation = record(task, settings, average, run, step + 1, result, count) if first else {}
+            if first and (used := usage.read()):
+                run.log(step + 1, used | measure_gpu(task.dataset.frames.device), phase="system")
             if validation:
                 best.update(step + 1, validation, average)
             stop = step + 1 < settings.steps and must_stop(run, settings, step + 1)
@@ -119,6 +122,11 @@ def train(
         run.write_manifest({"best_step": best.step or None})
     average.write_into_module()
     best.write_into_module()
+
+
+def measure_gpu(device: torch.device) -> dict[str, float]:
+    """Return the memory that torch holds on a GPU, GB; {} on a CPU."""
+    return {"GPU memory [GB]": torch.cuda.memory_reserved(device) / 1e9} if device.type == "cuda" else {}
 
 
 def must_stop(run: Run, settings: Optim, step: int) -> bool:

@@ -18,7 +18,7 @@ import torch
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_disk_error
 from memmlp.common.files import write_json
-from memmlp.common.progress import announce, notify
+from memmlp.common.progress import announce, keep_announcements, notify
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.modes import Evaluation, predict_first_clip
 from memmlp.evaluation.predictions import save_predictions
@@ -212,7 +212,7 @@ def record_outcome(experiment: Experiment, run: Run, again: bool = False) -> Ite
     missing = again or not run.done or not all(map(run.has, experiment.stage_ids))
     missing = missing or bool(list_missing_modes(experiment, run))
     loggers = experiment.loggers if missing else Loggers((), experiment.outputs)
-    with loggers.show_run(run):
+    with loggers.show_run(run), keep_announcements(run.log_path):
         try:
             yield
         except (LeaseLost, BrokenPipeError):

@@ -11,11 +11,13 @@ from memmlp.cli.runs.storage import (
     gc,
     import_,
     note,
+    prioritize,
     rename,
     restore,
     retry,
     stop,
     tag,
+    unprioritize,
 )
 
 
@@ -25,6 +27,7 @@ def runs() -> None:
 
 
 for command in (
-    list_runs, show, diff, tag, note, rename, stop, retry, archive, restore, delete, gc, export, import_,
+    list_runs, show, diff, tag, note, rename, stop, retry, prioritize, unprioritize, archive, restore, delete, gc,
+    export, import_,
 ):  # fmt: skip
     runs.add_command(command)

@@ -63,6 +63,8 @@ stop = _make_command(
     "sweep does not continue a stopped run before `memmlp runs retry RUN`.",
 )
 retry = _make_command("retry", "Let workers continue stopped runs, and repeat failed ones.")
+prioritize = _make_command("prioritize", "Let workers take these runs before other runs of their sweep.")
+unprioritize = _make_command("unprioritize", "Give these runs no priority any more.")
 archive = _make_command("archive", "Leave runs out of lists and the page. Their files stay.")
 restore = _make_command("restore", "Show archived runs in lists and the page again.")
 

@@ -42,7 +42,8 @@ COSTS = {
 """Listed costs of a deployment, with units. Lower values are better."""
 
 FILES = (
-    "config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "STOP", "results.json", "notes.json",
+    "config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "STOP", "PRIORITY", "results.json",
+    "notes.json", "log.txt",
 )  # fmt: skip
 STAGES_AFTER = ("evaluate", "export")  # the recorded times of the stages after training
 QUIET_LOOKS = 200  # runs without a process that are looked at in a refresh
@@ -92,7 +93,7 @@ class RunIndex:
         with contextlib.suppress(OSError):
             for name in os.listdir(folder / "deployments"):
                 stats += _stat_files(folder / "deployments" / name, ("latency.json",))
-        log = [stat for stat in stats if stat[1] == run.metrics_path.name]
+        log = [stat for stat in stats if stat[1] in (run.metrics_path.name, run.log_path.name)]
         record = _digest(sorted(set(stats) - set(log)))
         signature = f"{record}-{_digest(log)}"
         if before is None or before["signature"] != signature:
@@ -125,6 +126,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
         "name": notes.name or get_run_name(manifest, listed),
         "archived": notes.archived,
         "stopping": run.is_stop_requested,
+        "prioritized": run.is_prioritized,
         "kind": manifest.get("kind", ""),
         "done": run.done,
         "started": manifest.get("started", ""),

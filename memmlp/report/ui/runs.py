@@ -15,6 +15,7 @@ from memmlp.common.overrides import flatten
 from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.report.tables.table_text import find_direction, find_unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, list_preparations, read_config
+from memmlp.runs import records
 from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import add_solver_names, read_report
 from memmlp.runs.identity import NETWORK, NEUTRAL, is_data_path
@@ -24,11 +25,12 @@ from memmlp.sweep.definition import MODES
 
 VIEWABLE_FILES = (
     "config.yaml", "manifest.json", "metrics.jsonl", "code.patch", "FAILED", "notes.json", "poses.png",
-    "actions.jsonl",
+    "actions.jsonl", "log.txt",
 )  # fmt: skip
 """Run files that the page may show without changes."""
 
 MAX_FILES = 200
+MAX_TEXT = 16_000  # bytes of a log or patch on a run's page
 SECONDS = "seconds"  # the curve of working time
 MAX_GAP = 3600.0  # seconds between two entries; a longer gap is an interruption
 MAX_POINTS = 400  # approximate maximum number of points of a curve
@@ -36,7 +38,7 @@ MAX_POINTS = 400  # approximate maximum number of points of a curve
 ROW_FACTS = (
     "id", "name", "kind", "status", "started", "finished", "seconds", "device", "tags", "note", "failure",
     "damage", "data", "data_name", "code", "steps", "recent", "signature", "batch", "since", "marks",
-    "prerequisite", "archived", "stopping",
+    "prerequisite", "archived", "stopping", "prioritized",
 )  # fmt: skip
 """The facts of a run in its table row."""
 
@@ -179,6 +181,9 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         "clips": clips,
         "partial": count_partial_clips(clips),
         "latency": _read_latency(run),
+        "log": _read_end(run.log_path),
+        "patch": _read_end(run.folder / "code.patch"),
+        "traceback": records.read(run.folder / "FAILED", records.Failure).get("details", ""),
         "changed": run.verify() if run.done else [],
         "outdated": list_outdated_modes(run),
         "files": _list_files(run.folder),
@@ -226,6 +231,16 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
         }
         for clip, errors in found.items()
     ]
+
+
+def _read_end(path: Path) -> str:
+    """Return the last lines of a text file; empty if it is missing."""
+    try:
+        with open(path, "rb") as file:
+            file.seek(max(path.stat().st_size - MAX_TEXT, 0))
+            return file.read(MAX_TEXT).decode(errors="replace")
+    except OSError:
+        return ""
 
 
 def _read_latency(run: Run) -> dict[str, Any]:

@@ -43,6 +43,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
 VIEWS = "views.json"  # the saved views in the outputs folder
+FUTURE = ("stop", "prioritize", "unprioritize")  # changes of runs that a sweep has not begun
 READ_SECONDS = 0.8  # for new runs before an answer
 MAX_PAUSE = 10.0  # seconds between two scans
 MAX_CURVES = 60  # maximum number of runs in an answer with curves
@@ -175,7 +176,7 @@ class Answers:
             write_json(self.outputs / VIEWS, {name: address for name, address in views.items() if address})
         planned = {task.id for known in self.sweeps.known.values() for task in known.plan.tasks}
         for run_id in request.get("runs", ()) if action != "view" else ():
-            if run_id not in self.index.runs and not (action == "stop" and run_id in planned):
+            if run_id not in self.index.runs and not (action in FUTURE and run_id in planned):
                 raise InputError(f"run {run_id}: not found")
             run = Run.from_id(self.outputs, run_id)
             if action == "delete":

@@ -177,18 +177,21 @@ class Sweeps:
     def _estimate_remaining_seconds(
         self, plan: Plan, states: Mapping[str, str], steps: Mapping[str, tuple[int, int]]
     ) -> float | None:
-        """Estimate the remaining training time with the current number of busy workers, seconds.
-
-        It is None if no worker trains, or if all networks are trained.
-        """
+        """Estimate the remaining time with the current number of busy workers, seconds, from the pace of
+        training and the times of finished runs' evaluation and export. It is None without a busy worker, or
+        if no pace is known."""
         running = [task for task in plan.tasks if states[task.key] in STAGE_WORDS.values()]
         paces = [
             pace for task in plan.tasks if (pace := _estimate_pace(self.index.runs.get(task.id))) is not None
         ]
         if not running or not paces:
             return None
-        remaining = sum(left for key, (_, left) in steps.items() if states[key] not in FAULTY)
-        return remaining * statistics.median(paces) / len(running) if remaining else None
+        left = [task for task in plan.tasks if states[task.key] not in ("done", *FAULTY)]
+        remaining = sum(steps[task.key][1] for task in left) * statistics.median(paces)
+        later = [run["after"] for run in self.index.runs.values() if run["after"] and run["kind"] == NETWORK]
+        after = statistics.median(later) if later else 0.0
+        remaining += after * sum(task.kind == NETWORK for task in left)
+        return remaining / len(running) if remaining else None
 
     def _get_results(self, known_sweep: KnownSweep) -> dict[str, Any]:
         """Return the results of a sweep's runs; compute them again if the sweep or a run has changed."""
