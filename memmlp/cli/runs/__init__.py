@@ -27,7 +27,7 @@ def runs() -> None:
 
 
 for command in (
-    list_runs, show, diff, tag, note, rename, stop, retry, prioritize, unprioritize, archive, restore, delete, gc,
-    export, import_,
+    list_runs, show, diff, tag, note, rename, stop, retry, prioritize, unprioritize, archive, restore, delete,
+    gc, export, import_,
 ):  # fmt: skip
     runs.add_command(command)

@@ -39,8 +39,24 @@ export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short
   const line = (contents, head) => h('tr', {}, contents.map((content, i) => cell(content, i, head)));
   const grid = h('table', { class: `grid ${kind}` }, caption && h('caption', {}, caption),
     heads && h('thead', {}, line(heads, true)), h('tbody', {}, rows.map(row => line(row))));
-  const save = h('button', { type: 'button', class: 'csv', title: 'Save this table as CSV', onclick: () => download('table.csv', toCsv(grid)) }, 'CSV');
-  return h('div', { class: 'saved' }, h('div', { class: scroll }, grid), heads ? save : null);
+  const save = (text, onclick) => h('button', { type: 'button', title: `Save this table as ${text}`, onclick }, text);
+  const saves = heads && h('span', { class: 'save' }, save('CSV', () => download('table.csv', toCsv(grid))), save('PNG', () => savePng('table.png', grid)));
+  return h('div', { class: 'saved' }, h('div', { class: scroll }, grid), saves);
+}
+
+// Save an element as a picture, as it is shown now.
+export async function savePng(name, element) {
+  const [width, height] = [element.scrollWidth + 16, element.scrollHeight + 16];
+  const style = `color-scheme: ${matchMedia('(prefers-color-scheme: dark)').matches ? 'dark' : 'light'}`;
+  const rules = [...document.styleSheets].flatMap(sheet => [...sheet.cssRules]).map(rule => rule.cssText).join('\n');
+  const copy = h('div', { style: `${style}; padding: 8px; height: 100%; background: var(--card); color: var(--ink); font: 14px/1.5 system-ui, sans-serif` }, h('style', {}, rules), element.cloneNode(true));
+  const drawn = `<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}" style="${style}"><foreignObject width="100%" height="100%">${new XMLSerializer().serializeToString(copy)}</foreignObject></svg>`;
+  const image = Object.assign(new Image(), { src: `data:image/svg+xml,${encodeURIComponent(drawn)}` });
+  await image.decode();
+  const scale = Math.min(2, 16000 / Math.max(width, height));
+  const canvas = Object.assign(document.createElement('canvas'), { width: scale * width, height: scale * height });
+  canvas.getContext('2d').drawImage(image, 0, 0, canvas.width, canvas.height);
+  canvas.toBlob(blob => download(name, blob));
 }
 
 // A table as CSV: the cells' data-csv, or else their text. A text that a spreadsheet would run as a formula begins with '.
@@ -52,8 +68,8 @@ export function toCsv(grid) {
   return [...grid.rows].map(row => cells(row).map(cell => field(guard(text(cell)))).join(',')).join('\r\n') + '\r\n';
 }
 
-export function download(name, text) {
-  const href = URL.createObjectURL(new Blob([text], { type: 'text/csv' }));
+export function download(name, content) {
+  const href = URL.createObjectURL(new Blob([content], { type: content.type ?? 'text/csv' }));
   h('a', { href, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(href), 10000);
 }

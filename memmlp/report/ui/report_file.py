@@ -14,6 +14,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
 MAX_POINTS = 120  # approximate maximum number of points of a curve
+MAX_LOG = 2000  # characters of a run's log
 MAX_CLIPS = 60  # maximum number of clips of a run
 MAX_REPLAYS = 4  # maximum number of replays
 REPLAY_SECONDS = 4
@@ -83,7 +84,7 @@ def _shorten_run_page(page: Mapping[str, Any]) -> dict[str, Any]:
     """Keep only the clips with the largest errors on a run's page, and shorten the manifest."""
     manifest = {key: value for key, value in page["manifest"].items() if not key.startswith(LONG_FACTS)}
     clips = sorted(page["clips"], key=_find_sort_error, reverse=True)[:MAX_CLIPS]
-    return {**page, "clips": clips, "manifest": manifest}
+    return {**page, "clips": clips, "manifest": manifest, "log": page["log"][-MAX_LOG:], "patch": ""}
 
 
 def _find_sort_error(clip: Mapping[str, Any]) -> float:

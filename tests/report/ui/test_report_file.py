@@ -12,7 +12,7 @@ def clip(name: str, error: Any) -> dict[str, Any]:
 
 def test_clips_without_a_number_are_the_worst():
     clips = [clip("good", 3.0), clip("nan", "nan"), clip("bad", 9.0), {"name": "none"}, clip("inf", "inf")]
-    kept = _shorten_run_page({"clips": clips, "manifest": {}})["clips"]
+    kept = _shorten_run_page({"clips": clips, "manifest": {}, "log": ""})["clips"]
     assert [one["name"] for one in kept] == ["nan", "inf", "bad", "good", "none"]
 
 

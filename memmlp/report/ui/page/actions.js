@@ -41,9 +41,9 @@ export async function copy(text) {
 // A command with a button that copies it.
 export const command = text => h('div', { class: 'command' }, h('pre', {}, text), button('Copy', () => copy(text)));
 
-async function showCommand(id) {
-  const text = (await ask(`command/${id}`)).command;
-  dialog('The command that trains this run', { field: 'textarea', value: text, word: 'Copy', act: () => copy(text) });
+async function showCommands(ids) {
+  const text = (await Promise.all(ids.map(id => ask(`command/${id}`)))).map(found => found.command).join('\n');
+  dialog('What trains this again', { field: 'textarea', value: text, word: 'Copy', act: () => copy(text) });
 }
 
 async function askToDelete(ids, done) {
@@ -66,9 +66,10 @@ export function buttons(ids, done) {
   const [one] = list;
   const single = list.length === 1;
   return [
-    single && one.kind === 'memmlp' && !inFile ? button('Command', guard(() => showCommand(one.id)), 'The command that trains this run') : null,
+    list.some(run => run.kind === 'memmlp') && !inFile ? button('Command', guard(() => showCommands(list.filter(run => run.kind === 'memmlp').map(run => run.id))), 'The commands that train these runs') : null,
     ...(canChange() ? [
       unfinished.length ? button('Stop', send('stop', unfinished), 'Its worker writes a checkpoint at the next step, and stops') : null,
+      unfinished.length ? one.prioritized ? button('No priority', send('unprioritize', unfinished)) : button('Prioritise', send('prioritize', unfinished), 'The workers of its sweep take it next') : null,
       waiting.length ? button('Retry', send('retry', waiting), 'The workers of its sweep continue it; otherwise repeat its command') : null,
       single ? edit('Name', 'name', 'input', nameOf(one)) : null, edit('Tags', 'tags', 'input', one.tags.join(' ')), edit('Note', 'note', 'textarea', single ? one.note : ''),
       one.archived ? button('Restore', send('restore', list)) : button('Archive', send('archive', list), 'Hide it; its files stay'),

@@ -1,6 +1,6 @@
 // Charts by Observable Plot, in the page's colours, each with a sentence for screen readers.
 
-import { h, replace } from './dom.js';
+import { h, replace, savePng } from './dom.js';
 import { number } from './format.js';
 
 const { d3, Plot } = window;
@@ -9,16 +9,15 @@ const COLOURS = Array.from({ length: 10 }, (_, i) => `var(--series${i})`);
 const MAX_POINTS = 240; // of a band
 let latest = 0; // the last chart's width: most have the same, so that a redrawn one does not jump
 
-// A figure that is drawn again when its width changes. draw(width) returns an element.
-export function figure(label, draw) {
+// A figure that is drawn again when its width changes. draw(width) returns an element; a legend is below.
+export function figure(label, draw, legend = null) {
   const frame = h('div', { class: 'plot' });
   let width = latest;
   const render = () => {
     if (!width) return;
     const drawn = draw(width);
-    const svg = drawn.tagName === 'svg' ? drawn : drawn.querySelector('svg');
-    svg?.setAttribute('role', 'img');
-    svg?.setAttribute('aria-label', label);
+    drawn.setAttribute('role', 'img');
+    drawn.setAttribute('aria-label', label);
     replace(frame, drawn);
   };
   new ResizeObserver(([entry]) => {
@@ -26,8 +25,11 @@ export function figure(label, draw) {
     if (wide && wide !== width) { width = latest = wide; render(); }
   }).observe(frame);
   render();
-  return h('figure', { class: 'chart' }, frame);
+  const content = h('div', {}, frame, legend && h('figcaption', { class: 'keys' }, legend));
+  return h('figure', { class: 'chart' }, content, h('span', { class: 'save' }, h('button', { type: 'button', title: 'Save this plot as PNG', onclick: () => savePng('plot.png', content) }, 'PNG')));
 }
+
+const legendKey = (mark, text, colour) => h('span', { class: 'scale' }, h('b', { style: colour && `color:${colour}` }, mark), text);
 
 const base = (width, height, more) => ({
   width, height, marginLeft: 56, marginRight: 16, marginTop: 22, marginBottom: 34,
@@ -95,22 +97,29 @@ export function forest(rows, { label, smallest }) {
   const known = rows.filter(row => row.mean !== null);
   const domain = rows.map(row => row.variant);
   const colour = row => ({ holds: 'var(--good)', opposite: 'var(--bad)' })[row.verdict] ?? 'var(--accent)';
-  const shorten = name => (name.length > 34 ? `${name.slice(0, 33)}…` : name);
+  const [single, several] = [known.filter(row => row.low === null), known.filter(row => row.low !== null)];
+  const papers = rows.filter(row => row.paper !== null);
+  const margin = width => Math.min(nameWidth(domain), 230, width * 0.38);
+  const shorten = (name, most) => (name.length > most ? `${name.slice(0, most - 1)}…` : name);
   const draw = width => Plot.plot(base(width, 64 + 34 * domain.length, {
-    marginLeft: Math.min(nameWidth(domain), 230, width * 0.38), marginBottom: 38,
-    x: { label: `${label}, difference`, grid: true, zero: true, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none' },
-    y: { domain, label: null, tickSize: 0, tickFormat: shorten },
+    marginLeft: margin(width), marginBottom: 38,
+    x: { label: `${label}, difference`, grid: true, zero: true, nice: true, inset: 14, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none' },
+    y: { domain, label: null, tickSize: 0, tickFormat: name => shorten(name, Math.floor((margin(width) - 18) / 6.6)) },
     marks: [
       smallest ? Plot.rect([0], { x1: -smallest, x2: smallest, fill: 'var(--faint)', fillOpacity: 0.1 }) : null,
       Plot.ruleX([0], { stroke: 'var(--faint)' }),
-      Plot.link(known.filter(row => row.low !== null), { x1: 'low', x2: 'high', y1: 'variant', y2: 'variant', stroke: colour, strokeWidth: 2.5, strokeLinecap: 'round' }),
-      Plot.dot(known, { x: 'mean', y: 'variant', r: 5.5, stroke: colour, strokeWidth: 2, fill: row => (row.significant ? colour(row) : 'var(--card)') }),
-      Plot.dot(rows.filter(row => row.paper !== null), { x: 'paper', y: 'variant', symbol: 'diamond', r: 6, fill: 'none', stroke: 'var(--ink)', strokeWidth: 1.5, dy: 11 }),
+      Plot.link(several, { x1: 'low', x2: 'high', y1: 'variant', y2: 'variant', stroke: colour, strokeWidth: 2.5, strokeLinecap: 'round' }),
+      Plot.dot(several, { x: 'mean', y: 'variant', r: 5.5, stroke: colour, strokeWidth: 2, fill: row => (row.significant ? colour(row) : 'var(--card)') }),
+      Plot.dot(single, { x: 'mean', y: 'variant', symbol: 'times', r: 4.5, stroke: 'var(--faint)', strokeWidth: 2 }),
+      Plot.dot(papers, { x: 'paper', y: 'variant', symbol: 'diamond', r: 6, fill: 'none', stroke: 'var(--ink)', strokeWidth: 1.5, dy: 11 }),
       tip(known, { x: 'mean', y: 'variant', title: row => `${row.variant}\n${row.words}` }),
     ],
   }));
   const sentence = known.map(row => `${row.variant}: ${row.words}`).join('; ');
-  return figure(`${label}, differences from the control. ${sentence}`, draw);
+  const band = `smallest effect of interest, ±${number(smallest)}`;
+  return figure(`${label}, differences from the control. ${sentence}`, draw, [
+    several.some(row => row.significant) && legendKey('●', 'significant after Holm’s correction'), several.some(row => !row.significant) && legendKey('○', 'not significant', 'var(--accent)'),
+    single.length ? legendKey('×', 'one seed: undecided') : null, papers.length ? legendKey('◇', 'the paper’s difference', 'var(--ink)') : null, smallest ? legendKey('▒', band) : null]);
 }
 
 // Errors with their intervals against a cost on a logarithmic axis, one curve for each series.
@@ -118,20 +127,17 @@ export function frontier(points, { x, y }) {
   const colours = colourOf(new Set(points.map(point => point.series)));
   const colour = point => colours.get(point.series);
   const words = point => `${point.variant}: ${number(point.mean)} at ${number(Number(point.cost.toPrecision(3)))}`;
-  const last = [...colours.keys()].map(series => points.filter(point => point.series === series).at(-1));
   const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.6, 240), 400), {
-    marginRight: Math.min(nameWidth([...colours.keys()]), width * 0.3),
     x: { type: 'log', label: x, ticks: Math.min(width / 90, 6), tickFormat: '~g' },
     y: { label: y, grid: true, nice: true, ticks: 5 },
     marks: [
       Plot.link(points.filter(point => point.low !== null), { x: 'cost', y1: 'low', y2: 'high', stroke: colour, strokeWidth: 1.5, strokeOpacity: 0.6 }),
       Plot.line(points, { x: 'cost', y: 'mean', z: 'series', stroke: colour, strokeWidth: 2 }),
       Plot.dot(points, { x: 'cost', y: 'mean', r: 4, fill: colour }),
-      Plot.text(last, { x: 'cost', y: 'mean', text: 'series', textAnchor: 'start', dx: 8, fill: colour }),
       tip(points, { x: 'cost', y: 'mean', title: words }),
     ],
   }));
-  return figure(`${y} against ${x}. ${points.map(words).join('; ')}`, draw);
+  return figure(`${y} against ${x}. ${points.map(words).join('; ')}`, draw, [...colours].map(([series, one]) => legendKey('●', series, one)));
 }
 
 // Points { x, y, text, best } in two measures; a line joins the best ones. open(point): called by a click.
@@ -151,6 +157,53 @@ export function scatter(points, { x, y, open, joined = true, log = false }) {
     return plot;
   };
   return figure(`${y} by ${x}; the best are ${best.map(point => number(point.y)).join(', ')}.`, draw);
+}
+
+// A value over two keys, from scattered points { x, y, value, text }.
+export function contour(points, { x, y, label, log, open }) {
+  const scale = key => ({ label: key, nice: true, ticks: 6, type: log.includes(key) ? 'log' : 'linear', tickFormat: '~g' });
+  const draw = width => {
+    const plot = Plot.plot(base(width, 340, {
+      x: scale(x), y: scale(y), color: { scheme: 'viridis', reverse: true, legend: true, label, width: 220 },
+      marks: [
+        Plot.contour(points, { x: 'x', y: 'y', fill: 'value', interpolate: 'barycentric', blur: 2, thresholds: 12, fillOpacity: 0.7 }),
+        Plot.dot(points, { x: 'x', y: 'y', fill: 'value', stroke: 'var(--ink)', r: 4.5 }),
+        tip(points, { x: 'x', y: 'y', title: 'text' }),
+      ],
+    }));
+    plot.addEventListener('click', () => plot.value && open(plot.value));
+    return plot;
+  };
+  return figure(`${label} by ${x} and ${y}`, draw);
+}
+
+// Lines over parallel axes. rows: { text, values }; the last axis colours the lines.
+export function parallel(rows, axes, { log = [], open }) {
+  const scales = new Map(axes.map(name => {
+    const found = rows.map(row => row.values[name]).filter(value => (value ?? null) !== null);
+    const numbers = found.length > 0 && found.every(value => typeof value === 'number');
+    const ends = numbers ? d3.extent(found) : [...new Set(found.map(String))].sort();
+    const at = numbers ? (log.includes(name) ? d3.scaleLog(ends, [0, 1]) : d3.scaleLinear(ends, [0, 1])) : d3.scalePoint(ends, [0, 1]);
+    return [name, { at: value => at(numbers ? value : String(value)), ends: ends.length > 9 ? [ends[0], ends.at(-1)] : ends }];
+  }));
+  const colour = d3.scaleSequential(d3.interpolateViridis).domain([1, 0]);
+  const points = rows.flatMap(row => axes.filter(name => (row.values[name] ?? null) !== null).map(name => ({ row, name, at: scales.get(name).at(row.values[name]), text: row.text })));
+  const ticks = axes.flatMap(name => scales.get(name).ends.map(value => ({ name, at: scales.get(name).at(value), text: typeof value === 'number' ? number(value) : String(value).slice(0, 18) })));
+  const last = new Map(points.filter(point => point.name === axes.at(-1)).map(point => [point.row, point.at]));
+  const draw = width => {
+    const plot = Plot.plot(base(width, 320, {
+      marginLeft: 50, marginRight: 50, x: { domain: axes, type: 'point', label: null, tickSize: 0, tickFormat: name => name.split('.').slice(-2).join('.').slice(-Math.max(width / axes.length / 7, 6)) }, y: { axis: null, domain: [0, 1] },
+      marks: [
+        Plot.ruleX(axes, { stroke: 'var(--line)' }),
+        Plot.line(points, { x: 'name', y: 'at', z: 'row', stroke: point => (last.has(point.row) ? colour(last.get(point.row)) : 'var(--faint)'), strokeOpacity: 0.75, strokeWidth: 1.4 }),
+        Plot.text(ticks, { x: 'name', y: 'at', text: 'text', dx: 4, textAnchor: 'start', stroke: 'var(--card)', strokeWidth: 4, fill: 'var(--ink)' }),
+        tip(points, { x: 'name', y: 'at', title: 'text' }),
+      ],
+    }));
+    plot.addEventListener('click', () => plot.value && open(plot.value.row));
+    return plot;
+  };
+  return figure(`${rows.length} lines over ${axes.join(', ')}; coloured by ${axes.at(-1)}`, draw);
 }
 
 // When each trial ran: { number, began, ended, kind, text }, in seconds.

@@ -23,13 +23,13 @@ export const shareDone = run => (run.steps && run.recent.length ? Math.min(run.r
 // The state of a run in words, and the progress of one that runs.
 export function status(run) {
   if (run.damage.length) return state('damaged', run.damage.join('; '));
-  if (!ACTIVE.includes(run.status)) return state(run.status, run.failure || undefined);
+  if (!ACTIVE.includes(run.status)) return state(run.status, run.failure || undefined, run.prioritized && run.status !== 'done' ? ', prioritised' : '');
   const share = shareDone(run);
   const left = secondsLeft(run);
   const trains = run.status === 'training';
   const percent = share === null ? 'starting' : `${Math.floor(100 * share)} %`;
   return h('span', { class: 'state running' }, trains && share !== null ? h('progress', { value: share, max: 1, 'aria-label': `${percent} trained` }) : null,
-    h('span', {}, trains ? percent : run.status), left === null ? null : h('small', {}, left ? `${duration(left)} remaining` : 'nearly done'), run.stopping ? h('small', {}, 'stops at its next step') : null);
+    h('span', {}, trains ? percent : run.status), left === null ? null : h('small', {}, left ? `${duration(left)} remaining` : 'nearly done'), run.prioritized ? h('small', {}, 'prioritised') : null, run.stopping ? h('small', {}, 'stops at its next step') : null);
 }
 
 // The panel above the table of runs; null if nothing runs and nothing has failed.

@@ -21,7 +21,8 @@ export async function page(id) {
 
   function draw() {
     replace(top, head(run), warnings(run), facts(run), results(run));
-    replace(bottom, run.clips.length ? clips(run, replay) : null, config(run), latency(run), files(run));
+    replace(bottom, log(run), run.clips.length ? clips(run, replay) : null, config(run), latency(run), files(run));
+    for (const lines of bottom.querySelectorAll('pre.log')) lines.scrollTop = lines.scrollHeight;
   }
   async function update() {
     const row = runs.get(id);
@@ -159,13 +160,20 @@ function latency({ latency: found }) {
   return section('Latency', h('p', { class: 'faint' }, `One streaming step on ${found.threads ?? 1} thread.`), pairs(shown.filter(([, value]) => value !== undefined)));
 }
 
+// The last lines that the run printed, and where it failed.
+function log(run) {
+  const text = [run.log, run.traceback].filter(Boolean).join('\n');
+  return text ? section('Log', h('pre', { class: 'log', tabindex: 0 }, text)) : null;
+}
+
 function files(run) {
   const name = file => (file.viewable && !inFile ? h('a', { href: `files/${run.id}/${encodeURIComponent(file.name)}`, target: '_blank', rel: 'noopener' }, file.name) : file.name);
   const sum = run.files.reduce((total, file) => total + file.bytes, 0);
   const manifest = Object.entries(run.manifest).filter(([key]) => !/^(attempts|sources|seconds|prerequisite_runs)/.test(key)).map(([key, value]) => [key, word(value)]);
   return section('Files and origin',
     h('details', {}, h('summary', {}, `${run.files.length} files, ${bytes(sum)}`), table(null, run.files.map(file => [name(file), bytes(file.bytes), run.changed.includes(file.name) ? 'changed' : '']))),
-    h('details', {}, h('summary', {}, 'Manifest'), pairs(manifest)));
+    h('details', {}, h('summary', {}, 'Environment: code, packages, machine'), pairs(manifest)),
+    run.patch ? h('details', {}, h('summary', {}, 'Patch of the code since its commit'), h('pre', { class: 'log' }, run.patch)) : null);
 }
 
 function pairs(rows) {

@@ -1,18 +1,18 @@
 // The table of runs: filter, sort, the columns in which they differ, tags and notes; and chosen runs with their curves.
 
-import { download, h, replace, link, section, select, empty, say, toCsv } from './dom.js';
+import { download, h, replace, link, savePng, section, select, empty, say, toCsv } from './dom.js';
 import { about, address, ask, inFile, nameOf, place, remember, runs } from './store.js';
 import { parse, matches } from './filter.js';
 import { curvePanel } from './curves.js';
 import { button, buttons, canChange, change, command, dialog } from './actions.js';
-import { scatter } from './charts.js';
+import { parallel, scatter } from './charts.js';
 import { baseline, difference, groupCell, grouper, groupings as groupsOf } from './groups.js';
 import { now, status } from './now.js';
 import { FINISHED, state, STATES, STATE_WORDS } from './state.js';
 import { ago, bestOf, better, columnWords, date, duration, DASH, metricNumber, metricText, metricWords, number, shortKeys, word } from './format.js';
 
 const STEP = 100; // rows that are drawn at once
-const VIEW = ['filter', 'sort', 'by', 'cols', 'base', 'x', 'y']; // what a saved view keeps
+const VIEW = ['filter', 'sort', 'by', 'cols', 'base', 'x', 'y', 'axes']; // what a saved view keeps
 const ORDER = new Intl.Collator(undefined, { numeric: true });
 const KEYS = 6; // config columns that are shown by default
 const METRICS = ['stream.rotation.MPJPE', 'stream.rotation.MPJRE', 'stream.rotation.MPJVE', 'stream.rotation.Jitter', 'latency.median_ms'];
@@ -64,7 +64,7 @@ export async function page(name, route) {
     oninput: () => { ui.drawn = STEP; set({ filter: filter.value }); },
   });
   const scroll = h('div', { class: 'scroll tall' }, table, more);
-  const [nothing, happening, tools, picked, plot] = Array.from({ length: 5 }, () => h('div'));
+  const [nothing, happening, tools, picked, plot, lines] = Array.from({ length: 6 }, () => h('div'));
   const remarks = h('p', { class: 'faint' });
   picked.className = 'picked';
 
@@ -91,6 +91,7 @@ export async function page(name, route) {
     if (!inUse(picked)) selection();
     if (!inUse(tools)) replace(tools, toolbar(query, pinned, settings.group));
     scatterOf(query);
+    axesOf(query);
     const count = name => ui.list.filter(run => run.status === name).length;
     replace(counted, [`${number(ui.list.length)} of ${number(runs.size)} runs`, ...STATES.filter(count).map(name => `${number(count(name))} ${STATE_WORDS[name] ?? name}`)].join(', '));
     replace(dataSets, ui.data.length > 1 ? `On ${ui.data.length} data sets, whose errors are not comparable; filter by one: ${ui.data.slice(0, 5).map(data => `data=${data}`).join(', ')}` : null);
@@ -117,7 +118,8 @@ export async function page(name, route) {
       Object.keys(ui.views ?? {}).length ? select('View', [['', 'choose'], ...Object.keys(ui.views).map(one => [one, one])], view, openView) : null,
       canChange() && !only ? h('div', { class: 'chips' }, button('Save view', () => dialog('Save view', { field: 'input', value: view, act: text => store(text, here || 'sort=-started') })),
         view ? button('Delete view', () => dialog(`Delete the view ${view}?`, { word: 'Delete', act: () => store(view, '') })) : null) : null,
-      button('CSV', () => download('runs.csv', toCsv(whole())), 'All rows and shown columns'),
+      button('Parallel axes', () => set({ axes: query.get('axes') ? '' : 'yes' }), 'Each run as a line over the shown columns; pin columns to add axes'),
+      button('CSV', () => download('runs.csv', toCsv(whole())), 'All rows and shown columns'), button('PNG', () => savePng('runs.png', table), 'The rows shown'),
       h('div', { class: 'chips' }, pinned.map(one => button(`${one} ×`, () => pin(pinned.filter(other => other !== one)), 'Unpin')), ui.base ? button(`Baseline: ${ui.base.name} ×`, () => set({ base: '' })) : null));
   }
 
@@ -133,6 +135,15 @@ export async function page(name, route) {
     ui.plotted = key;
     return replace(plot, section('Scatter', h('div', { class: 'tools' }, select('Horizontal', [...about.keys, ...about.metrics].map(one => [one, one]), x, value => set({ x: value }))),
       points.length ? scatter(points, { x, y: metricText(y), joined: false, open: point => { location.hash = address('run', point.run.id); } }) : h('p', { class: 'faint' }, 'No run has both.')));
+  }
+
+  function axesOf(query) {
+    const rows = query.get('axes') ? ui.list.slice(0, 500).map(run => ({ id: run.id, text: nameOf(run), values: { ...run.config, ...run.metrics } })) : [];
+    const axes = [...ui.columns].sort((a, b) => about.metrics.includes(a) - about.metrics.includes(b)).slice(0, NARROW.matches ? 4 : 9);
+    const key = JSON.stringify([axes, rows.map(row => [row.id, axes.map(name => row.values[name])])]);
+    if (key === ui.axes) return;
+    ui.axes = key;
+    replace(lines, rows.length && axes.length > 1 ? section('Parallel axes', parallel(rows, axes, { open: row => { location.hash = address('run', row.id); } })) : null);
   }
 
   function head(sort) {
@@ -224,7 +235,7 @@ export async function page(name, route) {
   const element = h('div', { class: 'page wide' },
     only && h('p', { class: 'trail' }, link('#/runs', 'Runs')),
     h('div', { class: 'bar' }, h('h1', {}, title), counted, h('label', { class: 'search' }, h('span', { class: 'hidden' }, 'Filter of runs'), filter), compare),
-    only ? null : happening, dataSets, tools, picked, scroll, remarks, nothing, plot, panel && section('Curves', panel.element));
+    only ? null : happening, dataSets, tools, picked, scroll, remarks, nothing, plot, lines, panel && section('Curves', panel.element));
   async function update() {
     draw(true);
     await panel?.update();

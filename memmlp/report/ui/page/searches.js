@@ -2,7 +2,7 @@
 
 import { cards, h, replace, link, section, empty, select, table } from './dom.js';
 import { address, ask, place, remember, runs } from './store.js';
-import { scatter, spans } from './charts.js';
+import { contour, parallel, scatter, spans } from './charts.js';
 import { columnWords, duration, number, shortKeys, word } from './format.js';
 import { state } from './state.js';
 
@@ -62,9 +62,23 @@ function body(search, update) {
     h('div', { class: 'pair' }, section('History', scatter(history, { x: 'trial', y: objective, open })), importance && section('Importance', importance)),
     section('Slices', h('p', { class: 'faint' }, `${objective} by the value of each key.`), h('div', { class: 'charts' }, search.keys.map(key => h('div', { class: 'panel-chart' }, scatter(
       history.filter(point => point.params[key] !== undefined).map(point => ({ ...point, x: typeof point.params[key] === 'number' ? point.params[key] : word(point.params[key]), best: search.front.includes(point.number) })), { x: short.get(key), y: objective, open, joined: false, log: search.log.includes(key) }))))),
+    contours(search, history, objective, open, update),
+    search.keys.length > 1 ? section('Parallel axes', parallel(history.map(point => ({ ...point, values: { ...point.params, [objective]: point.y } })), [...search.keys.slice(0, 8), objective], { log: search.log, open })) : null,
     timeline(search),
     trials(search, short),
   ];
+}
+
+// The objective over two numeric keys, at first the two most important ones.
+function contours(search, history, objective, open, update) {
+  const ranked = [...new Set([...search.importance.map(([key]) => key), ...search.keys])].filter(key => history.filter(point => typeof point.params[key] === 'number').length > 3);
+  if (ranked.length < 2) return null;
+  const { query } = place();
+  const x = ranked.find(key => key === query.get('x')) ?? ranked[0];
+  const y = ranked.find(key => key === query.get('y') && key !== x) ?? ranked.find(key => key !== x);
+  const choose = (label, key, value) => select(label, ranked.map(one => [one, one]), value, one => { remember({ [key]: one }); update(); });
+  const points = history.filter(point => [x, y].every(key => typeof point.params[key] === 'number')).map(point => ({ ...point, x: point.params[x], y: point.params[y], value: point.y }));
+  return section('Contour', h('div', { class: 'tools' }, choose('Horizontal', 'x', x), choose('Vertical', 'y', y)), contour(points, { x, y, label: objective, log: search.log, open }));
 }
 
 function timeline(search) {

@@ -15,6 +15,6 @@ const STATE_TITLES = {
 // The class of a status: all work on a run looks the same.
 export const look = status => (ACTIVE.includes(status) ? 'running' : status);
 
-export function state(status, title = STATE_TITLES[status]) {
-  return h('span', { class: `state ${look(status)}`, title }, STATE_WORDS[status] ?? status);
+export function state(status, title = STATE_TITLES[status], more = '') {
+  return h('span', { class: `state ${look(status)}`, title }, `${STATE_WORDS[status] ?? status}${more}`);
 }

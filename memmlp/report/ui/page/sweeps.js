@@ -28,7 +28,7 @@ function progress(sweep) {
   const missing = sweep.counts.trained ? ' (trained: an evaluation or export is missing)' : '';
   const before = words(sweep.prerequisite_counts);
   const text = `${words(sweep.counts)}${missing}${before ? `; prerequisites: ${before}` : ''}`;
-  const remaining = sweep.remaining === null ? '' : ` · about ${duration(sweep.remaining)} of training remaining`;
+  const remaining = sweep.remaining === null ? '' : ` · about ${duration(sweep.remaining)} remaining`;
   return h('span', {}, h('progress', { value: sweep.share, max: 1, 'aria-label': 'done' }), ` ${Math.floor(100 * sweep.share)} % `, h('small', {}, `${text}${remaining}`));
 }
 
@@ -61,7 +61,7 @@ function again(sweep) {
   const send = (action, list) => change({ action, runs: list }).catch(error => dialog('Not done', { lines: [error.message], word: 'Close', act: () => {} }));
   const open = document.querySelector('details.again')?.open; // before it is drawn again
   return h('details', { class: 'again', open }, h('summary', {}, 'Command'), command(sweep.command),
-    canChange() ? h('div', { class: 'chips' }, going.length ? button(`Stop ${going.length} unfinished`, () => send('stop', going)) : null, waiting.length ? button(`Retry ${waiting.length} stopped or failed`, () => send('retry', waiting), 'Its workers continue them; without workers, repeat the command') : null) : null);
+    canChange() ? h('div', { class: 'chips' }, going.length ? select('Prioritise a variant', [['', 'choose'], ...[...new Set(sweep.cells.filter(cell => going.includes(cell.id)).map(cell => cell.variant))].map(one => [one, one])], '', one => one && send('prioritize', sweep.cells.filter(cell => cell.variant === one && going.includes(cell.id)).map(cell => cell.id))) : null, going.length ? button(`Stop ${going.length} unfinished`, () => send('stop', going)) : null, waiting.length ? button(`Retry ${waiting.length} stopped or failed`, () => send('retry', waiting), 'Its workers continue them; without workers, repeat the command') : null) : null);
 }
 
 // The tables of all sweeps below each other.
@@ -123,8 +123,7 @@ function effects(found, draw, head = 'h2') {
     variant, mean: null, low: null, high: null, ...cell.effect, paper: cell.paper_effect ?? null, significant: significant(cell.effect), words: effectWords(cell),
   }));
   const choose = changes => { remember(changes); draw(); };
-  const note = [`Difference from ‘${found.control}’, or from the variant’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction.`,
-    rows.some(row => row.paper !== null) && [' ', h('span', { class: 'diamond' }, '◇'), ' the paper’s difference.'], { lower: ' Left is better.', higher: ' Right is better.' }[found.better[metric]], ' The band is the smallest effect of interest.'];
+  const note = [`Difference from ‘${found.control}’, or from the variant’s own control, with its 95 % interval over seeds and clips.`, { lower: ' Left is better.', higher: ' Right is better.' }[found.better[metric]]];
   return h('section', {}, h(head, {}, 'Effects'),
     h('div', { class: 'tools' }, select('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), found.modes.length > 1 ? select('Mode', found.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
     h('p', { class: 'faint' }, note), forest(rows, { label: found.headings[metric].replace(/ ↓| ↑/, ''), smallest: found.smallest[metric] }));
