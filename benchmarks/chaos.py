@@ -2,20 +2,26 @@
 
     python benchmarks/chaos.py --runs 12 --kills 20
     python benchmarks/chaos.py --during export --kills 40 --trials 0
+    python benchmarks/chaos.py --stops 30 --trials 0
 
 Exits with 1 where they differ. tests/kills runs the same with a few kills.
 """
 
+import contextlib
 import csv
+import json
 import os
 import random
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+import urllib.error
+import urllib.request
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -25,6 +31,7 @@ import yaml
 
 from memmlp.common.files import file_digest
 from memmlp.common.lease import Lock, is_alive
+from memmlp.report.ui.server import Answers, RunsServer
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
@@ -58,10 +65,20 @@ Launch = Callable[[], subprocess.Popen[bytes]]
     default="anything",
     help="Kill workers of a sweep only then.",
 )
+@click.option(
+    "--stops", default=0, help="How often the page stops a run of the sweep meanwhile, and retries it."
+)
 @click.option("--seed", default=0, show_default=True, help="Seed of the choice of victims and pauses.")
 @click.argument("overrides", nargs=-1)
 def main(
-    runs: int, kills: int, controllers: int, trials: int, during: str, seed: int, overrides: tuple[str, ...]
+    runs: int,
+    kills: int,
+    controllers: int,
+    trials: int,
+    during: str,
+    stops: int,
+    seed: int,
+    overrides: tuple[str, ...],
 ) -> None:
     """Run a sweep, then a search, under random SIGKILLs.
 
@@ -70,7 +87,7 @@ def main(
     """
     of_search = round(SEARCH_SHARE * kills) if trials else 0
     dice = random.Random(seed)
-    problems = sweep_storm(runs, kills - of_search, controllers, dice, overrides, during)
+    problems = sweep_storm(runs, kills - of_search, controllers, dice, overrides, during, stops)
     if trials:
         problems += search_storm(trials, of_search, controllers, dice, overrides)
     click.echo("\n".join([*problems, f"{kills} kills: {len(problems)} differences"]))
@@ -84,8 +101,9 @@ def sweep_storm(
     dice: random.Random,
     overrides: Sequence[str],
     during: str = "anything",
+    stops: int = 0,
 ) -> list[str]:
-    """Run a sweep of two variants under kills, and list how it differs from an undisturbed one."""
+    """Run a sweep of two variants under kills and stops, and list how it differs from an undisturbed one."""
     with tempfile.TemporaryDirectory() as folder:
         sweep = Path(folder) / "chaos.yaml"
         variants = {"vq": [], "none": ["memory=none"]}
@@ -94,8 +112,47 @@ def sweep_storm(
         calm, stormy = Path(folder) / "calm", Path(folder) / "stormy"
         assert start(arguments, calm, workers=2).wait() == 0, "the undisturbed sweep failed"
         launches = [partial(start, arguments, stormy, workers=1)] * controllers
-        storm(launches, stormy, kills, PAUSES, dice, during)
+        with stop_and_retry(stormy, stops, dice) as left:
+            storm(launches, stormy, kills, PAUSES, dice, during, left)
         return compare(calm, stormy)
+
+
+@contextlib.contextmanager
+def stop_and_retry(outputs: Path, stops: int, dice: random.Random) -> Iterator[Callable[[], int]]:
+    """Stop runs by the page's server, one after another, and retry each; yield how many are left."""
+    counts = Counter({"left": stops})
+    with RunsServer(Answers(outputs, lambda *_: {}, 0.2), 0) as server:
+
+        def work() -> None:
+            while counts["left"] > 0:
+                time.sleep(dice.uniform(*PAUSES) / 3)
+                runs = [Run(folder) for folder in outputs.glob("runs/*/")]
+                if unfinished := [
+                    run for run in runs if run.activity or (run.checkpoint.exists() and not run.done)
+                ]:
+                    run = dice.choice(unfinished)
+                    stopped = change(server, run, "stop")
+                    time.sleep(dice.uniform(0.0, 3.0))
+                    if stopped:
+                        counts["seen"] += run.state(False) == "stopped"
+                        counts["left"] -= change(server, run, "retry")
+            print(f"{stops} stops, of which {counts['seen']} were obeyed before their retry")
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        yield lambda: counts["left"]
+        thread.join()
+
+
+def change(server: RunsServer, run: Run, action: str) -> bool:
+    """Ask the page's server for a change of a run, like the page; return whether it was done."""
+    headers = {"X-Memmlp-Token": server.change_token, "Content-Type": "application/json"}
+    body = json.dumps({"action": action, "runs": [run.id]}).encode()
+    request = urllib.request.Request(f"{server.url}api/change", body, headers)
+    try:
+        return urllib.request.urlopen(request).status == 200
+    except urllib.error.HTTPError:  # it has finished meanwhile
+        return False
 
 
 def search_storm(
@@ -127,15 +184,16 @@ def storm(
     pauses: tuple[float, float],
     dice: random.Random,
     during: str = "anything",
+    left: Callable[[], int] = lambda: 0,
 ) -> None:
-    """Keep the processes running until all have succeeded, and kill random ones meanwhile.
+    """Keep the processes running until all have succeeded and no stops are `left`, and kill random ones.
 
     A process that was killed, or that ended before the last kill, is restarted. If all have ended before a
     kill, the next pause is half as long.
     """
     processes = [launch() for launch in launches]
     killed, factor, counts = 0, 1.0, Counter[Path]()
-    while killed < kills or any(process.poll() != 0 for process in processes):
+    while killed < kills or left() or any(process.poll() != 0 for process in processes):
         time.sleep(factor * dice.uniform(*pauses))
         if killed < kills:
             victims = list_victims(processes, outputs, during)
@@ -150,7 +208,7 @@ def storm(
                 killed += 1
         for index, launch in enumerate(launches):
             code = processes[index].poll()
-            if code not in (None, 0) or (code == 0 and killed < kills):
+            if code not in (None, 0) or (code == 0 and (killed < kills or left())):
                 processes[index] = launch()
     wait_for_release(outputs)
 

@@ -41,7 +41,7 @@ export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short
     heads && h('thead', {}, line(heads, true)), h('tbody', {}, rows.map(row => line(row))));
   const save = (text, onclick) => h('button', { type: 'button', title: `Save this table as ${text}`, onclick }, text);
   const saves = heads && h('span', { class: 'save' }, save('CSV', () => download('table.csv', toCsv(grid))), save('PNG', () => savePng('table.png', grid)));
-  return h('div', { class: 'saved' }, h('div', { class: scroll }, grid), saves);
+  return h('div', { class: 'saved' }, saves, h('div', { class: scroll }, grid));
 }
 
 // Save an element as a picture, as it is shown now.

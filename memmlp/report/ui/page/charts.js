@@ -39,6 +39,7 @@ const base = (width, height, more) => ({
 
 export const colourOf = groups => new Map([...groups].map((group, i) => [group, COLOURS[i % COLOURS.length]]));
 
+const plain = d3.format('~g'); // a scale's own format would write 4e+1
 const nameWidth = names => Math.max(...names.map(name => name.length)) * 6.6 + 18;
 const tip = (data, options) => Plot.tip(data, Plot.pointer({ fill: 'var(--card)', stroke: 'var(--line)', textPadding: 8, ...options }));
 
@@ -55,8 +56,8 @@ export function curves(series, { label, log = false, smooth = 0, colours, axis =
   const lines = points.filter(point => single.has(point.group));
   const tips = [...wide, ...lines.map(point => ({ ...point, mean: point.value }))];
   const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.42, 220), 400), {
-    x: { label: axis, ticks: Math.min(width / 90, 8), tickFormat: axis === 'hours' ? '~g' : '~s' },
-    y: { label, type: log ? 'log' : 'linear', grid: true, nice: true, ticks: 5, tickFormat: log ? undefined : '~g' },
+    x: { label: axis, ticks: Math.min(width / 90, 8), tickFormat: axis === 'hours' ? plain : '~s' },
+    y: { label, type: log ? 'log' : 'linear', grid: true, nice: true, ticks: 5, tickFormat: log ? undefined : plain },
     marks: [
       Plot.areaY(wide, { x: 'step', y1: 'low', y2: 'high', z: 'group', fill: point => colours.get(point.group), fillOpacity: 0.16 }),
       Plot.line(lines, { x: 'step', y: 'value', z: 'run', stroke: point => colours.get(point.group), strokeWidth: 1.8 }),
@@ -97,18 +98,19 @@ export function forest(rows, { label, smallest }) {
   const known = rows.filter(row => row.mean !== null);
   const domain = rows.map(row => row.variant);
   const colour = row => ({ holds: 'var(--good)', opposite: 'var(--bad)' })[row.verdict] ?? 'var(--accent)';
-  const [single, several] = [known.filter(row => row.low === null), known.filter(row => row.low !== null)];
+  const [single, several] = [known.filter(row => row.single), known.filter(row => !row.single)];
   const papers = rows.filter(row => row.paper !== null);
   const margin = width => Math.min(nameWidth(domain), 230, width * 0.38);
   const shorten = (name, most) => (name.length > most ? `${name.slice(0, most - 1)}…` : name);
-  const draw = width => Plot.plot(base(width, 64 + 34 * domain.length, {
-    marginLeft: margin(width), marginBottom: 38,
-    x: { label: `${label}, difference`, grid: true, zero: true, nice: true, inset: 14, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none' },
-    y: { domain, label: null, tickSize: 0, tickFormat: name => shorten(name, Math.floor((margin(width) - 18) / 6.6)) },
+  const draw = width => Plot.plot(base(width, 72 + 34 * domain.length, {
+    marginLeft: margin(width), marginBottom: 46,
+    x: { label: `${label}, difference`, grid: true, zero: true, nice: true, inset: 14, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none', labelOffset: 42 },
+    y: { domain, label: null, tickSize: 0, tickFormat: name => shorten(name, Math.round((margin(width) - 18) / 6.6)) },
     marks: [
       smallest ? Plot.rect([0], { x1: -smallest, x2: smallest, fill: 'var(--faint)', fillOpacity: 0.1 }) : null,
       Plot.ruleX([0], { stroke: 'var(--faint)' }),
-      Plot.link(several, { x1: 'low', x2: 'high', y1: 'variant', y2: 'variant', stroke: colour, strokeWidth: 2.5, strokeLinecap: 'round' }),
+      Plot.link(several.filter(row => row.low !== null), { x1: 'low', x2: 'high', y1: 'variant', y2: 'variant', stroke: colour, strokeWidth: 2.5, strokeLinecap: 'round' }),
+      Plot.link(single.filter(row => row.low !== null), { x1: 'low', x2: 'high', y1: 'variant', y2: 'variant', stroke: 'var(--faint)', strokeDasharray: '2 4' }),
       Plot.dot(several, { x: 'mean', y: 'variant', r: 5.5, stroke: colour, strokeWidth: 2, fill: row => (row.significant ? colour(row) : 'var(--card)') }),
       Plot.dot(single, { x: 'mean', y: 'variant', symbol: 'times', r: 4.5, stroke: 'var(--faint)', strokeWidth: 2 }),
       Plot.dot(papers, { x: 'paper', y: 'variant', symbol: 'diamond', r: 6, fill: 'none', stroke: 'var(--ink)', strokeWidth: 1.5, dy: 11 }),
@@ -146,7 +148,7 @@ export function scatter(points, { x, y, open, joined = true, log = false }) {
   const best = points.filter(point => point.best).sort((a, b) => a.x - b.x);
   const draw = width => {
     const plot = Plot.plot(base(width, 280, {
-      x: { label: x, grid: true, ...(isNumber ? { nice: true, ticks: Math.min(width / 90, 8), ...(log ? { type: 'log', tickFormat: '~g' } : { tickFormat: '~r' }) } : { type: 'point' }) }, y: { label: y, grid: true, nice: true, ticks: 6 },
+      inset: 10, x: { label: x, grid: true, ...(isNumber ? { nice: true, ticks: Math.min(width / 90, 8), ...(log ? { type: 'log', tickFormat: '~g' } : { tickFormat: '~r' }) } : { type: 'point' }) }, y: { label: y, grid: true, nice: true, ticks: 6 },
       marks: [
         Plot.line(joined ? best : [], { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.6, curve: 'step-after' }),
         Plot.dot(points, { x: 'x', y: 'y', r: 4.5, fill: point => (point.best ? 'var(--series1)' : 'var(--series0)'), fillOpacity: 0.85 }),
@@ -164,7 +166,7 @@ export function contour(points, { x, y, label, log, open }) {
   const scale = key => ({ label: key, nice: true, ticks: 6, type: log.includes(key) ? 'log' : 'linear', tickFormat: '~g' });
   const draw = width => {
     const plot = Plot.plot(base(width, 340, {
-      x: scale(x), y: scale(y), color: { scheme: 'viridis', reverse: true, legend: true, label, width: 220 },
+      inset: 10, x: scale(x), y: scale(y), color: { scheme: 'viridis', reverse: true, legend: true, label, width: 220 },
       marks: [
         Plot.contour(points, { x: 'x', y: 'y', fill: 'value', interpolate: 'barycentric', blur: 2, thresholds: 12, fillOpacity: 0.7 }),
         Plot.dot(points, { x: 'x', y: 'y', fill: 'value', stroke: 'var(--ink)', r: 4.5 }),
@@ -226,8 +228,8 @@ export function spans(rows, { label }) {
 export function timeline(values, { fps, label, go, marks, colours }) {
   const points = values.flatMap((one, i) => one.errors.map((error, frame) => ({ time: frame / fps, error, name: one.name, i })));
   const draw = width => {
-    const plot = Plot.plot(base(width, 120, {
-      marginTop: 12, marginBottom: 28, x: { label: null, domain: [0, Math.max(values[0].errors.length - 1, 1) / fps] }, y: { label, grid: true, ticks: 3, zero: true, nice: true },
+    const plot = Plot.plot(base(width, 130, {
+      marginBottom: 28, x: { label: null, domain: [0, Math.max(values[0].errors.length - 1, 1) / fps] }, y: { label, grid: true, ticks: 3, zero: true, nice: true },
       marks: [
         Plot.rectX(marks, { x1: mark => mark.first / fps, x2: mark => mark.first / fps + 1, fill: 'var(--bad)', fillOpacity: (_, i) => (i ? 0.08 : 0.16) }),
         Plot.line(points, { x: 'time', y: 'error', z: 'i', stroke: point => colours[point.i], strokeWidth: 1.5 }),

@@ -84,7 +84,7 @@ export async function page(name, route) {
     const pinned = (query.get('cols') ?? '').split(',').filter(one => about.keys.includes(one) || about.metrics.includes(one));
     const measured = metrics.filter(one => !pinned.includes(one) && ui.list.some(run => run.metrics[one] !== undefined && run.metrics[one] !== null));
     const keys = differing(networks.length ? networks : ui.list, about.keys).slice(0, only ? undefined : KEYS).filter(one => !pinned.includes(one) && !(settings.group === 'same' && one === 'seed'));
-    ui.columns = [...pinned, ...(NARROW.matches ? [measured, keys] : [keys, measured]).flat()];
+    ui.columns = [...pinned, ...(NARROW.matches || settings.group ? [measured, keys] : [keys, measured]).flat()];
     ui.words = new Map(ui.columns.map(name => [name, columnWords(ui.list.map(run => run.config[name]))]));
     head(settings.sort);
     body();

@@ -119,8 +119,8 @@ function effects(found, draw, head = 'h2') {
   const tested = found.metrics.filter(metric => found.rows.some(row => row.cells[mode]?.[metric]?.effect));
   if (!tested.length) return h('section', {}, h(head, {}, 'Effects'), h('p', { class: 'faint' }, 'They appear when a variant and its control have a finished run of the same seed.'));
   const metric = tested.includes(query.get('metric')) ? query.get('metric') : tested[0];
-  const rows = found.rows.map(row => [row.label, row.cells[mode]?.[metric]]).filter(([, cell]) => cell?.effect || (cell?.paper_effect ?? null) !== null).map(([variant, cell]) => ({
-    variant, mean: null, low: null, high: null, ...cell.effect, paper: cell.paper_effect ?? null, significant: significant(cell.effect), words: effectWords(cell),
+  const rows = found.rows.map(row => [row.label, row.cells[mode]?.[metric], row.found.length < 2]).filter(([, cell]) => cell?.effect || (cell?.paper_effect ?? null) !== null).map(([variant, cell, single]) => ({
+    variant, single, mean: null, low: null, high: null, ...cell.effect, paper: cell.paper_effect ?? null, significant: significant(cell.effect), words: effectWords(cell),
   }));
   const choose = changes => { remember(changes); draw(); };
   const note = [`Difference from ‘${found.control}’, or from the variant’s own control, with its 95 % interval over seeds and clips.`, { lower: ' Left is better.', higher: ' Right is better.' }[found.better[metric]]];
