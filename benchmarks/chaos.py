@@ -124,19 +124,24 @@ def stop_and_retry(outputs: Path, stops: int, dice: random.Random) -> Iterator[C
     with RunsServer(Answers(outputs, lambda *_: {}, 0.2), 0) as server:
 
         def work() -> None:
+            idle = 0
             while counts["left"] > 0:
                 time.sleep(dice.uniform(*PAUSES) / 3)
                 runs = [Run(folder) for folder in outputs.glob("runs/*/")]
-                if unfinished := [
+                unfinished = [
                     run for run in runs if run.activity or (run.checkpoint.exists() and not run.done)
-                ]:
+                ]
+                idle = 0 if unfinished or not runs else idle + 1
+                if idle > PATIENCE / PAUSES[1]:  # the sweep has ended
+                    counts["late"], counts["left"] = counts["left"], 0
+                if unfinished:
                     run = dice.choice(unfinished)
                     stopped = change(server, run, "stop")
                     time.sleep(dice.uniform(0.0, 3.0))
                     if stopped:
                         counts["seen"] += run.state(False) == "stopped"
                         counts["left"] -= change(server, run, "retry")
-            print(f"{stops} stops, of which {counts['seen']} were obeyed before their retry")
+            print(f"{stops - counts['late']} stops, of which {counts['seen']} were obeyed before their retry")
 
         thread = threading.Thread(target=work)
         thread.start()
