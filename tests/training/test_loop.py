@@ -9,6 +9,7 @@ import torch
 from tiny_tasks import OPTIM, TASKS, motion_task, weights
 
 from memmlp.common.errors import InputError, RunStopped, TrainingDiverged
+from memmlp.common.processes import UsageTimer
 from memmlp.networks import checkpoint
 from memmlp.runs.run import Run
 from memmlp.training.loop import train
@@ -129,8 +130,9 @@ def test_a_branch_that_is_not_validated_is_refused(tmp_path):
         train(task_with_errors({}), replace(BEST, best_by="position"), Run(tmp_path), 0, "it")
 
 
-def test_a_stopped_run_keeps_its_step_and_ends_in_the_same_weights(tmp_path):
+def test_a_stopped_run_keeps_its_step_and_ends_in_the_same_weights(tmp_path, monkeypatch):
     """It is asked to stop during step 5 of 8, two steps after the last checkpoint."""
+    monkeypatch.setattr(UsageTimer, "INTERVAL", 0.0)
     whole, stopped = Run(tmp_path / ("a" * 16)), Run(tmp_path / ("b" * 16))
     for run in (whole, stopped):
         run.folder.mkdir()
@@ -147,6 +149,8 @@ def test_a_stopped_run_keeps_its_step_and_ends_in_the_same_weights(tmp_path):
     with pytest.raises(RunStopped, match=f"memmlp runs retry {stopped.id}"):
         train(task, SHORT, stopped, 0, "stopped")
     assert checkpoint.read(stopped.checkpoint)[1]["step"] == 5
+    used = [one.values for one in stopped.metrics() if one.phase == "system"]
+    assert (len(used), all(0 < one["memory [GB]"] < 1000 for one in used)) == (5, True)
     stopped.retry()
     train(TASKS["streams"](optim=SHORT), SHORT, stopped, 0, "again")
     expected, got = weights(whole), weights(stopped)

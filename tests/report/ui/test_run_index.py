@@ -71,6 +71,10 @@ def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.Mo
     run.folder.rmdir()
     assert index.refresh() == first
     assert run.id not in index.runs
+    new = RunIndex(outputs)
+    new.refresh(seconds=-1)
+    assert (new.runs, new.unread) == ({}, 6)
+    assert (new.refresh() == first, new.unread) == (True, 0)
 
 
 def test_a_run_is_not_done_while_it_is_evaluated_or_once_its_deployment_failed(outputs: Path):
