@@ -137,9 +137,11 @@ def stop_and_retry(outputs: Path, stops: int, dice: random.Random) -> Iterator[C
                 if unfinished:
                     run = dice.choice(unfinished)
                     stopped = change(server, run, "stop")
-                    time.sleep(dice.uniform(0.0, 3.0))
+                    end = time.monotonic() + PATIENCE
+                    while run.state(run.complete) not in ("stopped", "done") and time.monotonic() < end:
+                        time.sleep(0.2)
                     if stopped:
-                        counts["seen"] += run.state(False) == "stopped"
+                        counts["seen"] += run.state(run.complete) == "stopped"
                         counts["left"] -= change(server, run, "retry")
             print(f"{stops - counts['late']} stops, of which {counts['seen']} were obeyed before their retry")
 
