@@ -40,7 +40,7 @@ from memmlp.report.tables.table_text import (
     format_counts,
     format_effect,
     format_mean,
-    format_paper,
+    format_paper_value,
     list_remarks,
     make_caption,
     make_heading,
@@ -221,7 +221,7 @@ def _make_short_table(source: KeptTable) -> str:
             lines.append([*head, seeds, *numbers])
         if any(cell.paper is not None for cell, _ in cells):
             first = ["" if row.found else one for one in head]
-            lines.append([*first, "paper", *(format_paper(cell, metric) for cell, metric in cells)])
+            lines.append([*first, "paper", *(format_paper_value(cell, metric) for cell, metric in cells)])
     columns = [_make_column_heading(source, metric) for metric in table.metrics]
     return _make_markdown_table(
         ["variant", *(["compared with"] if several else []), "seeds", *columns], lines

@@ -17,7 +17,7 @@ from memmlp.common.text_formats import make_override
     type=PATH,
     help="Folder for the true and predicted motion, with one npz file per test clip.",
 )
-@click.option("--json", "json_path", type=PATH, help="JSON file for the metrics: means, a row per clip.")
+@click.option("--json", "json_path", type=PATH, help="JSON file to write: mean metrics, and a row per clip.")
 @click.option("--again", is_flag=True, help="Repeat existing measurements.")
 @device_option
 @plugins_option
@@ -83,7 +83,7 @@ def evaluate(
 @click.argument("checkpoint", type=PATH)
 @click.argument("overrides", nargs=-1)
 @click.option("--mean", type=PATH, help="File with the mean of the rotations, if the network needs it.")
-@click.option("--std", type=PATH, help="File with the standard deviation of the rotations; with --mean.")
+@click.option("--std", type=PATH, help="File with the standard deviation of the rotations; needs --mean.")
 @click.option("--refiner", type=PATH, help="File with the weights of SAGE-Net's refiner.")
 @plugins_option
 @outputs_option

@@ -103,7 +103,7 @@ def export(
         raise InputError(f"--out {out}: there is no folder {out.parent}")
     option = f"--space {space}" if space else f"--rotations {rotations}" if rotations else None
     if scope == "step" and option:
-        raise InputError(f"{option}: needs --scope full; the network's inputs are in AMASS' world")
+        raise InputError(f"{option}: needs --scope full, since the other scope has AMASS' axes (Z up)")
     if precision == "fp32" and max_growth is not None:
         raise InputError(f"--max-growth {max_growth:g}: needs --precision fp16 or int8")
     if precision == "int8" and scope == "full":
@@ -181,8 +181,8 @@ def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
     line about the difference. Raises ClickException if they differ by more than rounding errors; then nothing
     is written."""
     from memmlp.common.progress import announce
-    from memmlp.deploy.parity import TOLERANCE, is_rounding, measure_differences, select_parity_clips
-    from memmlp.live.trackers_to_body_graph import measure_full_differences
+    from memmlp.deploy.parity import TOLERANCE, are_rounding_errors, measure_differences, select_parity_clips
+    from memmlp.live.trackers_to_body_graph import measure_full_graph_differences
 
     model, network = load(opened, form)
     (clip,) = select_parity_clips(model, opened.data.open("test").read_clips())
@@ -191,11 +191,11 @@ def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
         path = Path(folder) / "step.onnx"
         write_graph(network, path, opened.run.id, form)
         if form.full:
-            apart = measure_full_differences(model, path, clip, form.full[0])
+            apart = measure_full_graph_differences(model, path, clip, form.full[0])
         else:
             apart = measure_differences(model, path, clip)
         line = f"differs from torch by at most {float(apart.max()):.1e} on a test clip"
-        if not is_rounding(apart):
+        if not are_rounding_errors(apart):
             raise click.ClickException(
                 f"{out}: not written: {line}, more than {TOLERANCE:.0e}; please report this with the run's "
                 "config.yaml"
@@ -213,7 +213,7 @@ def write_lower(opened: OpenedRun, out: Path, form: ExportForm, max_growth: floa
     from memmlp.common.errors import InputError
     from memmlp.common.progress import announce
     from memmlp.deploy.lower_precision import compare_accuracy, write_lower_precision
-    from memmlp.live.trackers_to_body_graph import measure_full_differences
+    from memmlp.live.trackers_to_body_graph import measure_full_graph_differences
     from memmlp.networks.motion_model import StreamingGraph
 
     precision = form.precision
@@ -234,7 +234,7 @@ def write_lower(opened: OpenedRun, out: Path, form: ExportForm, max_growth: floa
         if form.full:
             write_graph(network, exact, opened.run.id, form)
             write_lower_precision(precision, exact, other, network, train)
-            apart = float(measure_full_differences(model, other, test[0], form.full[0]).max())
+            apart = float(measure_full_graph_differences(model, other, test[0], form.full[0]).max())
             line += f"; the full graph differs from torch by at most {apart:.1e} on the first test clip"
             if not apart <= FULL_TOLERANCE:
                 raise click.ClickException(f"{out}: not written: {line}, more than {FULL_TOLERANCE:g}")

@@ -176,7 +176,7 @@ def check_options(options: LiveOptions) -> None:
     if sum(source is not None for source in sources) > 1:
         raise InputError("--clip, --udp, --osc: expected only one source")
     if options.packets is None and options.space != SPACE:
-        raise InputError(f"--space {options.space}: must be {SPACE} with a clip; other spaces need packets")
+        raise InputError(f"--space {options.space}: must be {SPACE} with a clip; others are for tracker data")
     if options.packets and options.hz != HZ:
         raise InputError("--hz: needs a clip; packets arrive at any rate")
     if options.packets is None and (names := [name for name, used in tracker_options.items() if used]):

@@ -35,7 +35,7 @@ def results() -> None:
 @results.command("save")
 @click.argument("name", metavar="SWEEP")
 @click.argument("overrides", nargs=-1)
-@click.option("--out", type=HomePath(file_okay=False), default=FOLDER / "data", help="Folder of the file.")
+@click.option("--out", type=HomePath(file_okay=False), default=FOLDER / "data", help="Folder to write to.")
 @click.option(
     "--untrained",
     is_flag=True,
@@ -99,7 +99,7 @@ def save_command(
 @click.argument("name", metavar="NAME")
 @source_option
 @together_option
-@click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Folder above data/.")
+@click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Its data/ has the results.")
 def show(name: str, source: str | None, together: tuple[str, ...], folder: Path) -> None:
     """Print the table of kept results. NAME is the name of their file; no run is needed."""
     from memmlp.cli.table import print_tables

@@ -54,7 +54,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 @click.option(
     "--branch",
     type=click.Choice(BRANCHES),
-    help="Branch of the errors to show.  [default: as in the paper's table]",
+    help="Show errors of this branch: rotation, position or combined.  [default: as in the paper's table]",
 )
 @source_option
 @together_option
@@ -71,7 +71,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 @click.option(
     "--official",
     is_flag=True,
-    help="Show the published values, those of the authors' weights (memmlp import-weights) and those here.",
+    help="Show the published value, that of the authors' weights (memmlp import-weights) and yours.",
 )
 @config_dir_option
 @plugins_option
@@ -139,8 +139,8 @@ def print_official_values(tables: Sequence[SweepTable], outputs: Path, modes: Se
     """Print published values, values of imported weights and values of trainings, for each sweep."""
     from memmlp.report.tables.build_table import (
         find_imported_runs,
-        find_official_runs,
         list_official_values,
+        select_imported_runs,
     )
     from memmlp.report.tables.table_text import make_caption
 
@@ -151,7 +151,7 @@ def print_official_values(tables: Sequence[SweepTable], outputs: Path, modes: Se
         files = [
             f"{variant.label}: weights {run.origin.imported}"
             for variant in one.sweep.variants
-            for run in find_official_runs(one.sweep, variant, imported)
+            for run in select_imported_runs(one.sweep, variant, imported)
         ]
         lines = [*align_columns([head, *rows], left=3), *files, ""]
         click.echo("\n".join([make_caption(one.table), *lines]))

@@ -199,7 +199,7 @@ def show(setup: SearchSetup) -> None:
 def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
     """Run the study until it has all trials of the search."""
     from memmlp.sweep.plan import Plan
-    from memmlp.sweep.search.director import Director, direct_search
+    from memmlp.sweep.search.director import Director, run_search
     from memmlp.sweep.search.progress_table import SearchBoard
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
@@ -216,7 +216,7 @@ def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
 
     director = Director(study, partial(_make_tasks, setup), plan, check)
     path, fleet = start_fleet(setup.folder, plan, workers, {base.config["device"]})
-    direct_search(director, fleet, SearchBoard(setup.outputs), path)
+    run_search(director, fleet, SearchBoard(setup.outputs), path)
 
 
 def write_results(setup: SearchSetup, study: Study) -> None:

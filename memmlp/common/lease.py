@@ -107,7 +107,7 @@ class ChangeTimer:
         self.seen: dict[Hashable, tuple[object, float]] = {}
 
     def seconds_unchanged(self, key: Hashable, read: Callable[[], object]) -> float:
-        """Read a value, and return for how many seconds it has at least been unchanged; 0 at first."""
+        """Read a value, and return a lower bound of the seconds since its last change; 0 at first."""
         before = self.clock()  # if this process is frozen while it reads, that time must not count
         value = read()
         last = self.seen.get(key)
@@ -140,8 +140,8 @@ class Claim(NamedTuple):
         return None
 
     def can_be_taken_over(self, idle: float) -> bool | None:
-        """Return whether another process may claim the folder, which has been idle for these seconds; None if
-        it has to wait for LEASE."""
+        """Return whether another process may claim the folder, idle for `idle` seconds; None if it must wait
+        for the whole LEASE."""
         alive = is_alive(self.owner) if self.owner else None
         if self.free or alive is False or idle > LEASE:
             return True

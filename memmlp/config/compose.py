@@ -157,7 +157,7 @@ def compose_jobs(args: argparse.Namespace) -> list[DictConfig]:
             with _convert_errors(overrides):
                 configs.append(_compose_job(args, overrides))
             check(configs[-1])
-            _check_effects(configs[-1], overrides)
+            _reject_overrides_without_effect(configs[-1], overrides)
     _check_texts(configs[0], args.overrides)
     return configs
 
@@ -252,7 +252,7 @@ def _make_node(slot: str, name: str) -> DictConfig | None:
     return None
 
 
-def _check_effects(cfg: DictConfig, overrides: Sequence[str]) -> None:
+def _reject_overrides_without_effect(cfg: DictConfig, overrides: Sequence[str]) -> None:
     """Raise InputError for overrides without an effect: a plugin in a config file, and a split fraction if
     each source sets its own."""
     for name in cfg.plugins:

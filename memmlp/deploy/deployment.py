@@ -14,8 +14,8 @@ from memmlp.deploy.lower_precision import compare_accuracy, write_lower_precisio
 from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import (
     TOLERANCE,
+    are_rounding_errors,
     count_frames_until_past_is_full,
-    is_rounding,
     measure_differences,
     select_parity_clips,
 )
@@ -88,7 +88,7 @@ class Deployment:
             )
         apart = measure_differences(model, deployed.onnx, clip)
         worst = float(apart.max())
-        if not is_rounding(apart):
+        if not are_rounding_errors(apart):
             raise RuntimeError(
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e}; "
                 f"must be at most {TOLERANCE:.0e}, or rounding errors"
@@ -114,7 +114,7 @@ class Deployment:
         return record
 
     def measure_times(self, model: MotionModel, path: Path) -> dict[str, float]:
-        """Time a step of an exported file, and of the network without conversions if `alone` is set."""
+        """Time a step of an exported file. If `alone` is set, also time the network without conversions."""
         from memmlp.deploy.export import export
 
         record = latency.measure_step_times(path, self.latency_steps)

@@ -17,7 +17,7 @@ from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import Blend
 
 TOLERANCE = 1e-4  # for 6D components and metres
-ROUNDING = 10 * TOLERANCE  # the largest median difference from rounding; see `is_rounding`
+ROUNDING = 10 * TOLERANCE  # the largest median difference from rounding; see `are_rounding_errors`
 MARGIN = 60  # number of frames to compare after the network's history is full
 
 
@@ -83,7 +83,7 @@ def measure_differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
     return (expected - exported).abs().amax(1)
 
 
-def is_rounding(apart: Tensor) -> bool:
+def are_rounding_errors(apart: Tensor) -> bool:
     """Return whether the differences (N,) between torch and ONNX Runtime are rounding errors.
 
     They are if all are at most TOLERANCE, or if their median is at most ROUNDING. Some frames can differ more

@@ -115,7 +115,7 @@ def check_time(time: float | None) -> None:
     if time is None:
         return
     if not isinstance(time, (int, float, np.integer, np.floating)) or not abs(time) <= LATEST:
-        raise InputError(f"time={time}: must be seconds, at most {LATEST:g}, or None for one frame")
+        raise InputError(f"time={time}: must be seconds, at most {LATEST:g}, or None")
 
 
 ODD = {

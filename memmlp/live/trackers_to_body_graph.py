@@ -180,7 +180,9 @@ def extract_trackers(frames: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([positions[:1] - velocity, positions]), torch.cat([before, rotations])
 
 
-def measure_full_differences(model: MotionModel, path: Path, clip: Tensor, space: str = "amass") -> Tensor:
+def measure_full_graph_differences(
+    model: MotionModel, path: Path, clip: Tensor, space: str = "amass"
+) -> Tensor:
     """Return each frame's largest difference (N,) between torch and an ONNX file over a clip (N, 252). Each
     uses its own history. torch computes the same as evaluation: features, network and
     `Normalizer.compute_positions`. If a quaternion does not have length 1, all differences are infinity."""

@@ -210,13 +210,13 @@ def rename_published(
             raise ValueError(f"{key}: is not a part of the published network; change the overrides")
         name, part, parts = _split_name(theirs, match.groups())
         if name not in tensors:
-            raise ValueError(f"{name}: is missing, expected shape {_describe(own.shape, parts)}")
+            raise ValueError(f"{name}: is missing, expected shape {_join_parts(own.shape, parts)}")
         tensor = tensors[name]
         seen.add(name)
         if parts > 1 and tensor.dim() and tensor.shape[0] % parts == 0:
             tensor = tensor.chunk(parts)[part]
         if _squeeze(tensor.shape) != _squeeze(own.shape) or (parts > 1 and tensor is tensors[name]):
-            expected_shape = _describe(own.shape, parts)
+            expected_shape = _join_parts(own.shape, parts)
             raise ValueError(f"{name}: has shape {tuple(tensors[name].shape)}, expected {expected_shape}")
         renamed[key] = tensor.to(own.dtype).reshape(own.shape).clone()
     for name in tensors:
@@ -243,5 +243,5 @@ def _squeeze(shape: Iterable[int]) -> list[int]:
     return [size for size in shape if size != 1]
 
 
-def _describe(shape: torch.Size, parts: int) -> tuple[int, ...]:
+def _join_parts(shape: torch.Size, parts: int) -> tuple[int, ...]:
     return (shape[0] * parts, *shape[1:]) if parts > 1 else tuple(shape)

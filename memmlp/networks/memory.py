@@ -285,7 +285,7 @@ class RecurrentFeature(nn.Module):
 
 
 class RecurrentRecall(Recall):
-    """Recall for recurrent memories; features before the first frame are zeros."""
+    """The `Recall` of recurrent memories. Features before the first frame are zeros."""
 
     def merge_features(self, features: Sequence[Any]) -> None:
         """Store the index of each block's recurrent layer, and replace GRUs by plain layers."""

@@ -51,10 +51,10 @@ class MotionModel(nn.Module):
             past.
         settled: whether the recalled values of a past frame never change, so that a live stream may keep
             them.
-        windowless: whether the network is a stream in both evaluation modes; see WindowlessModel.
+        windowless: whether both evaluation modes run the network as a stream; see WindowlessModel.
         frames_per_call: number of new frames per call of a stream's evaluation. More than 1 needs a network
             whose motion is the same, up to rounding, for calls with one frame each.
-        is_stream: whether the network runs without future frames. If not, only window mode can evaluate it.
+        is_stream: whether the network needs no future frames. If not, only window mode can evaluate it.
         takes_whole_clip: whether window mode passes a whole clip to `predict_clip`, which may overlap
             windows.
     """

@@ -62,7 +62,7 @@ class DenoiserAtSamplingTimes(nn.Module):
 
     def forward(self, noisy: Tensor, condition: Tensor, index: int) -> Tensor:
         """Map noisy latents (T // 2, 384) at sampling step `index` to clean latents."""
-        h = condition + self.noisy(self.denoiser.align_frames(noisy))
+        h = condition + self.noisy(self.denoiser.mix_frames(noisy))
         for block, modulation in zip(self.blocks, self.modulations[index], strict=True):
             h = block.compute_newest(h, modulation.chunk(6), h.shape[-2])
         return self.denoiser.head(h)

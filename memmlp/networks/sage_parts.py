@@ -293,7 +293,7 @@ class UpperDenoiser(nn.Module):
         self.blocks = nn.ModuleList(DiTBlock(width, settings.heads, 4) for _ in range(settings.depth))
         self.head = nn.Linear(width, LATENT)
 
-    def align_frames(self, latent: Tensor) -> Tensor:
+    def mix_frames(self, latent: Tensor) -> Tensor:
         """Mix the frames of latents (B, T // 2, 384)."""
         return self.align(latent.transpose(-1, -2)).transpose(-1, -2)
 
@@ -306,7 +306,7 @@ class UpperDenoiser(nn.Module):
 
     def denoise(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
         """Map noisy latents (B, T // 2, 384), times (B,) and a condition (B, T // 2, d) to clean latents."""
-        h = self.stem(torch.cat([condition, self.align_frames(noisy)], -1))
+        h = self.stem(torch.cat([condition, self.mix_frames(noisy)], -1))
         embedding = F.silu(self.time(time))
         for block in self.blocks:
             h = block(h, embedding)

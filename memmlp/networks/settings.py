@@ -102,7 +102,7 @@ class NetworkSettings(Settings):
             if heads in model and model[width] % model[heads]:
                 yield f"model.{heads}={model[heads]}: must be a divisor of model.{width}={model[width]}"
         if model.get("offline"):
-            yield from _offline_problems(config)
+            yield from _find_offline_conflicts(config)
         calls, steps = model.get("sampling_steps", 1), model.get("diffusion_steps", 1)
         if calls > steps:
             yield f"model.sampling_steps={calls}: must be at most model.diffusion_steps={steps}"
@@ -118,7 +118,7 @@ class NetworkSettings(Settings):
         return cls.defaults.get("prerequisite")
 
 
-def _offline_problems(config: Any) -> Iterator[str]:
+def _find_offline_conflicts(config: Any) -> Iterator[str]:
     if list(config["evaluation"]["modes"]) != ["window"] or config["export"]["graph"] != "off":
         yield (
             "model.offline=true: needs evaluation.modes=[window] and export.graph=off, since it uses "

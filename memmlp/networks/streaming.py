@@ -173,7 +173,7 @@ class OneFrameConversion(nn.Module):
 
 
 class StemGraph(StreamingGraph):
-    """The base class of windowed networks' streaming graphs, which carries a stem's output for each frame.
+    """The base class of windowed networks' streaming graphs. The state has a stem's output for each frame.
 
     Attributes:
         width: d, the number of values carried for each frame.

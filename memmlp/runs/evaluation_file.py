@@ -91,11 +91,11 @@ def add_solver_names(results: Mapping[str, Any], solvers: Mapping[str, str | Non
     """Add the solver's name (by mode, `find_combined_solvers`) to the branch `combined`: "combined-
     lbfgs-15"."""
 
-    def rename(mode: str, branch: str) -> str:
+    def name_branch(mode: str, branch: str) -> str:
         return f"{branch}-{solvers[mode]}" if branch == COMBINED and solvers.get(mode) else branch
 
     return {
-        mode: {rename(mode, branch): errors for branch, errors in branches.items()}
+        mode: {name_branch(mode, branch): errors for branch, errors in branches.items()}
         if isinstance(branches, Mapping)
         else branches
         for mode, branches in results.items()

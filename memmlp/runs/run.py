@@ -153,7 +153,7 @@ class Run:
 
     @property
     def deployment_as_configured(self) -> DeploymentFolder:
-        """The deployment with the measurements for tables (`find_shown_deployment`)."""
+        """The deployment that tables show for the run's own config (`find_shown_deployment`)."""
         return self.find_shown_deployment(self.config)
 
     def find_shown_deployment(self, config: Mapping[str, Any]) -> DeploymentFolder:
@@ -170,11 +170,11 @@ class Run:
         )  # fmt: skip
 
     def _find_best_deployment(
-        self, config: Mapping[str, Any], rank: Callable[[DeploymentFolder], tuple[Any, ...]]
+        self, config: Mapping[str, Any], sort_key: Callable[[DeploymentFolder], tuple[Any, ...]]
     ) -> DeploymentFolder:
         every = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
         matching = [one for one in every if one.done and has_configured_inference(one.settings, config)]
-        return max(matching, key=rank, default=None) or DeploymentFolder(self.deployments / "none")
+        return max(matching, key=sort_key, default=None) or DeploymentFolder(self.deployments / "none")
 
     @property
     def preferred_onnx(self) -> Path:

@@ -65,7 +65,7 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
     name = path.stem
     if not name.isprintable() or not name.strip(". ") or len(name.encode()) > MAX_NAME_BYTES:
         raise InputError(
-            f"{path.parent}: the name {name!r} must be printable, have other characters than dots, and be at "
+            f"{path.parent}: the name {name!r} must be printable, not only dots, and at "
             f"most {MAX_NAME_BYTES} bytes long; rename the sweep file"
         )
     try:

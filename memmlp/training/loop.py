@@ -130,7 +130,8 @@ def measure_gpu(device: torch.device) -> dict[str, float]:
 
 
 def must_stop(run: Run, settings: Optim, step: int) -> bool:
-    """Return in all processes whether somebody asked for the run's end. Several processes look less often."""
+    """Return in all processes whether somebody asked for the run's end. Several processes check only every
+    `log_every` steps."""
     if distributed.world_size() > 1 and step % settings.log_every:
         return False
     return distributed.broadcast(distributed.is_first() and run.is_stop_requested)

@@ -45,7 +45,7 @@ class TrainingJob:
 
 
 class Training:
-    """The interface of trainings, which train the weights of a run of this `kind` (see `Identity`)."""
+    """The interface of a training. It trains the weights of runs of one `kind` (see `Identity`)."""
 
     kind: str
 

@@ -125,7 +125,7 @@ def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytes
         next(Path("mine").rglob("*.npz")).unlink()
         director.update(2)
 
-    monkeypatch.setattr(director_module, "direct_search", replaced)
+    monkeypatch.setattr(director_module, "run_search", replaced)
     with pytest.raises(InputError, match="mine: clips have changed since the search started"):
         search(setup, study, Workers())
     assert len(study.trials) == 1

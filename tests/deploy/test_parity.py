@@ -11,7 +11,7 @@ import tiny
 import torch
 
 from memmlp.deploy import parity
-from memmlp.deploy.parity import TOLERANCE, is_rounding, select_parity_clips
+from memmlp.deploy.parity import TOLERANCE, are_rounding_errors, select_parity_clips
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.own_past_memory import MemoryWithoutCodes
@@ -52,7 +52,7 @@ def test_a_file_of_another_network_does_not_match(step_files: Callable[[str], Pa
         model.stem.bias += 2e-3
     apart = parity.measure_differences(model, path, CLIP)
     assert apart.max() > TOLERANCE
-    assert not is_rounding(apart)
+    assert not are_rounding_errors(apart)
 
 
 def test_almost_parallel_columns_are_no_failure(monkeypatch):
@@ -82,5 +82,5 @@ def test_larger_differences_need_a_small_median():
         (2 * parity.ROUNDING, False),
         (math.nan, False),
     ):
-        assert is_rounding(torch.full((9,), size)) == sound
-    assert is_rounding(few)
+        assert are_rounding_errors(torch.full((9,), size)) == sound
+    assert are_rounding_errors(few)

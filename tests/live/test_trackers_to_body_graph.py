@@ -18,7 +18,11 @@ from memmlp.deploy.parity import TOLERANCE
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
-from memmlp.live.trackers_to_body_graph import convert_to_quaternions, export_full, measure_full_differences
+from memmlp.live.trackers_to_body_graph import (
+    convert_to_quaternions,
+    export_full,
+    measure_full_graph_differences,
+)
 from memmlp.motion.geometry import axis_angle_to_matrix
 from memmlp.networks.streaming import make_streaming_graph
 
@@ -51,7 +55,7 @@ def test_it_is_the_stream(name: str, kind: str, folder: Path, step_files):
     if name == "amass":
         export_full(make_streaming_graph(network), file, RUN, name, "quaternion", opset=15)
         check_quaternions(onnx.load(file))
-    assert measure_full_differences(network, file, PERSON.frames, name).max() <= TOLERANCE
+    assert measure_full_graph_differences(network, file, PERSON.frames, name).max() <= TOLERANCE
     positions = space.convert_positions_from_amass(PERSON.positions)
     rotations = space.convert_rotations_from_amass(PERSON.rotations)
     poses = wearer.play(Stream(step_files(kind), space=name), positions, rotations)
@@ -90,11 +94,11 @@ def test_quaternions_are_exact_at_every_angle():
 
 def test_parity_sees_a_difference(network, folder: Path):
     file = folder / "unity.onnx"
-    assert measure_full_differences(network, file, PERSON.frames, "openxr").max() > TOLERANCE
+    assert measure_full_graph_differences(network, file, PERSON.frames, "openxr").max() > TOLERANCE
     other = copy.deepcopy(network)
     with torch.no_grad():
         other.stem.bias += 0.1
-    assert measure_full_differences(other, file, PERSON.frames, "unity").max() > TOLERANCE
+    assert measure_full_graph_differences(other, file, PERSON.frames, "unity").max() > TOLERANCE
 
 
 def test_interface_and_metadata(folder: Path):

@@ -28,7 +28,7 @@ MAX_NAMES = 8  # maximum number of skipped files to print; the manifest lists al
 
 def show_manifest(manifest: Manifest) -> None:
     """Print the split, frame rates and skipped files of a cache, and warnings about its split."""
-    from memmlp.motion.preparing.manifest import name_copies  # numpy is slow to import
+    from memmlp.motion.preparing.manifest import find_copies  # numpy is slow to import
 
     table = Table("part")
     for name in ("clips", "frames", "hours"):
@@ -46,7 +46,7 @@ def show_manifest(manifest: Manifest) -> None:
     show_rates(manifest.clips, manifest.interpolation)
     show_skipped(manifest.skipped)
     show_pairs("unusual", manifest.unusual, ": ")
-    show_pairs("some or all of the motion is the same", name_copies(manifest.clips))
+    show_pairs("some or all of the motion is the same", find_copies(manifest.clips))
     show_pairs("left out because another part contains some of its motion", manifest.duplicates)
     left_out = sum(manifest.left_out.values())
     click.echo(

@@ -101,7 +101,7 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
 
 
 def _read_records(runs: Sequence[Run], most: int) -> dict[str, Record]:
-    """Return the records of runs, until `most` of them are undamaged."""
+    """Read the records of runs in order; stop after `most` undamaged ones."""
     records: dict[str, Record] = {}
     for run in runs:
         if sum(one["status"] != "damaged" for one in records.values()) == most:

@@ -161,7 +161,12 @@ def export(run: str, out: Path | None, outputs: Path) -> None:
 @click.command("import")
 @click.argument("path", type=PATH)
 @click.option("--sha256", help="Expected digest, as printed by `memmlp runs export`.  [default: any]")
-@click.option("--max-gb", type=FiniteFloat(0, min_open=True), default=4.0, help="Maximum size in GB.")
+@click.option(
+    "--max-gb",
+    type=FiniteFloat(0, min_open=True),
+    default=4.0,
+    help="Maximum size of the unpacked run in GB.",
+)
 @outputs_option
 def import_(path: Path, sha256: str | None, max_gb: float, outputs: Path) -> None:
     """Import a run from a file that `memmlp runs export` wrote.

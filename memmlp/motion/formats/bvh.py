@@ -43,8 +43,8 @@ TIPS = {
 
 @dataclass(frozen=True)
 class Bvh(Recording):
-    """A BVH file. Its nodes are the joints, followed by the end sites. `channels` are each joint's, without
-    end sites, in the file's order."""
+    """A BVH file. Its nodes are the joints, followed by the end sites. `channels` are those of each joint, in
+    the file's order, without end sites."""
 
     channels: tuple[tuple[str, ...], ...]
 

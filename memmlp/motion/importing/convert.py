@@ -147,7 +147,7 @@ class Retargeting:
 def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotion) -> Stance:
     """Find the stance of a file: the rest pose in the map, else the zero pose, else the straightest frame.
     Raises InputError if the file has no such pose, or if left and right contradict each other."""
-    upright, positions, path = skeleton.upright, motion.positions, recording.path
+    upright, positions, path = skeleton.upright_rotation, motion.positions, recording.path
     stands = (why := anatomy.find_stance_fault(motion.zero)) is None
 
     def stance(rotations: np.ndarray, pose: np.ndarray, nodes: np.ndarray, source: str) -> Stance:
@@ -180,7 +180,7 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
         best = anatomy.find_stance_fault(positions[order[0]])
         raise InputError(
             f"{path}: the person stands neither in the zero pose ({why}) nor in a frame (best: {best}); "
-            "check up and joints in the map, or add rest to it"
+            "check the keys up: and joints: of the map, or add its key rest:"
         )
     sound = (frame for frame in standing if anatomy.find_side_fault(positions[frame], motion.mapped) is None)
     frame = next(sound, standing[0])

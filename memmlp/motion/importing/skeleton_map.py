@@ -55,7 +55,7 @@ class SkeletonMap:
         return self if up is None else replace(self, up=up)
 
     @property
-    def upright(self) -> np.ndarray:
+    def upright_rotation(self) -> np.ndarray:
         """The rotation (3, 3) from the file's axes to Y-up axes; requires `up`."""
         return UPRIGHT[str(self.up)]
 
@@ -275,12 +275,12 @@ def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
     )
     if len(rotations) == 0:
         raise InputError(f"{recording.path}: has only the calibration frame; must have two frames or more")
-    upright, unit = skeleton.upright, skeleton.unit
+    upright_rotation, unit = skeleton.upright_rotation, skeleton.unit
     return MappedMotion(
         path=recording.path,
         mapped=np.array([joint in skeleton.joints for joint in JOINTS]),
         nodes=nodes,
-        rotations=upright @ rotations @ upright.T,
-        positions=unit * positions @ upright.T,
-        zero=unit * recording.compute_zero_pose()[nodes] @ upright.T,
+        rotations=upright_rotation @ rotations @ upright_rotation.T,
+        positions=unit * positions @ upright_rotation.T,
+        zero=unit * recording.compute_zero_pose()[nodes] @ upright_rotation.T,
     )

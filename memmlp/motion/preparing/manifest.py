@@ -56,7 +56,7 @@ class Total(NamedTuple):
         return self.frames / FPS / 3600
 
 
-def name_copies(clips: Iterable[ClipRecord]) -> dict[str, str]:
+def find_copies(clips: Iterable[ClipRecord]) -> dict[str, str]:
     """Return the clips with common motion: clip -> the first clip with it."""
     firsts: dict[str, str] = {}
     moving = [clip for clip in clips if clip.content != STILL]
@@ -124,9 +124,9 @@ class Manifest:
         clips: the clips, sorted by name.
         skipped: bad files.
         left_out: top-level folder -> number of valid clips without a part.
-        listed: subset -> number of the split's entries (list entries, subsets); empty without a list.
+        listed: subset -> number of its entries in the split's list; empty without a list.
         missing: the split's entries without a valid clip; entries with a too short clip are not included.
-        duplicates: dropped clip -> the clip with common motion that stays in another part.
+        duplicates: dropped clip -> the kept clip of another part that contains the same motion.
         unusual: clip -> its likely mistakes (`plausibility.find_faults`).
         sources: names of the sources, with which clip names begin; empty for one folder.
         format: version of the cache format.

@@ -24,7 +24,7 @@ from memmlp.motion.preparing.duplicates import (
     merge_contents,
 )
 from memmlp.motion.preparing.find_clips import Root, find_clips, get_clip_name
-from memmlp.motion.preparing.manifest import STILL, ClipRecord, name_copies
+from memmlp.motion.preparing.manifest import STILL, ClipRecord, find_copies
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Survey:
     @property
     def duplicates(self) -> dict[str, str]:
         """Clip -> the first clip with common motion."""
-        return name_copies(self.clips)
+        return find_copies(self.clips)
 
 
 class TooShortError(InputError):

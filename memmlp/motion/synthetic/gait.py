@@ -245,11 +245,11 @@ def _draw_locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
     style = Style.draw(rng)
     course = _draw_course(rng, t, gait, style)
     puppet = stand(rng, t, style)
-    puppet.feet = _draw_feet(t, gait, style, course)
+    puppet.feet = _make_foot_paths(t, gait, style, course)
     puppet.settle = gait.settle
     puppet.heading = course.heading + 0.02 * make_wander(rng, t)
     puppet.pelvis += np.c_[course.path - style.origin, np.zeros(len(t))]
-    _carry_along(puppet, gait, style, course)
+    _move_pelvis(puppet, gait, style, course)
     _swing_along(puppet, gait, style, course)
     return puppet
 
@@ -271,8 +271,9 @@ def _draw_course(rng: np.random.Generator, t: Array, gait: Gait, style: Style) -
     return Course(path, heading, pace, phase, go)
 
 
-def _draw_feet(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
-    """Draw the feet. The left foot touches down at whole phases, the right foot half a cycle later."""
+def _make_foot_paths(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
+    """Make the paths of the feet. The left foot touches down at whole phases, the right one half a cycle
+    later."""
     start = FootPlacement(style.origin, float(course.heading[0]), style.width, style.splay)
     steps = []
     for side in (0, 1):
@@ -299,7 +300,7 @@ def _make_step(t: Array, gait: Gait, style: Style, course: Course, side: int, st
     )  # fmt: skip
 
 
-def _carry_along(puppet: Puppet, gait: Gait, style: Style, course: Course) -> None:
+def _move_pelvis(puppet: Puppet, gait: Gait, style: Style, course: Course) -> None:
     """Move the pelvis over the standing foot, up and down twice per cycle, and lean into turns."""
     cycle = 2 * np.pi * course.phase
     left = compute_direction(course.heading + np.pi / 2)

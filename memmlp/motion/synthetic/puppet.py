@@ -242,7 +242,7 @@ def _compute_root(puppet: Puppet, pelvis: Rotation) -> Array:
         length = STRETCH * _measure_chain(f"{name}_hip", f"{name}_knee", f"{name}_ankle")
         reach = np.sqrt(np.maximum(length**2 - (away[:, :2] ** 2).sum(-1), 0.0))
         limit = height + away[:, 2] + reach
-        carries = _extend_flags(puppet.feet.planted[:, side], frames // 2)
+        carries = _lengthen_steps(puppet.feet.planted[:, side], frames // 2)
         ceiling = np.where(carries, np.minimum(ceiling, limit), ceiling)
     root = puppet.pelvis.copy()
     root[:, 2] = compute_soft_minimum(height, smooth_below(ceiling, frames), 0.01)
@@ -264,7 +264,7 @@ def _solve_leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict
         pole,
         (_get_bone(f"{name}_hip", f"{name}_knee"), _get_bone(f"{name}_knee", f"{name}_ankle")),
         LEG_POLE,
-        smooth(1.0 - _extend_flags(puppet.feet.planted[:, side], frames), frames),
+        smooth(1.0 - _lengthen_steps(puppet.feet.planted[:, side], frames), frames),
     )
     return {
         f"{name}_hip": pelvis.inv() * thigh,
@@ -298,9 +298,9 @@ def _solve_arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation
     }
 
 
-def _extend_flags(flags: Array, frames: int) -> Array:
-    """Return whether a flag is set at most `frames` frames before or after each frame (N,)."""
-    return maximum_filter1d(flags, 2 * frames + 1, mode="nearest")
+def _lengthen_steps(planted: Array, frames: int) -> Array:
+    """Return whether a foot is planted at most `frames` frames before or after each frame (N,)."""
+    return maximum_filter1d(planted, 2 * frames + 1, mode="nearest")
 
 
 def _limit_reach(span: Array, full: float, free: Array | float) -> Array:

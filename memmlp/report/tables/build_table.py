@@ -112,7 +112,10 @@ def list_official_values(
     """
     rows = []
     for variant in sweep.variants:
-        theirs, trained = find_official_runs(sweep, variant, imported), runs.get(variant.label, {}).values()
+        theirs, trained = (
+            select_imported_runs(sweep, variant, imported),
+            runs.get(variant.label, {}).values(),
+        )
         found = [mode for mode in modes if any(mode in run.means for run in (*theirs, *trained))]
         for mode, metric in itertools.product(found or [""], sweep.metrics):
             printed = (variant.paper or {}).get(metric)
@@ -125,7 +128,9 @@ def list_official_values(
     return rows
 
 
-def find_official_runs(sweep: Sweep, variant: Variant, imported: Sequence[MeasuredRun]) -> list[MeasuredRun]:
+def select_imported_runs(
+    sweep: Sweep, variant: Variant, imported: Sequence[MeasuredRun]
+) -> list[MeasuredRun]:
     """Return the newest run of imported weights with the variant's network, refiner and data, if any."""
     chosen = select_last_by_key((*sweep.base, *sweep.command_line, *(variant.overrides or ())))
     keys = ("model", "data", "refiner")

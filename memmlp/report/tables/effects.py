@@ -282,9 +282,9 @@ class NeededSeeds(NamedTuple):
 def compute_needed_seeds(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]
 ) -> list[NeededSeeds]:
-    """Return the seeds needed for all testable comparisons with an effect in the paper.
+    """Return how many seeds each testable comparison with an effect in the paper needs to detect it.
 
-    As in the table, the correction includes both modes.
+    As in the table, the correction for multiple comparisons includes both modes.
     """
     shown = use_existing_branches(sweep, runs)
     pairs, variants = pair_differences(shown, runs, MODES), {one.label: one for one in shown.variants}

@@ -53,7 +53,7 @@ def find_flags(
 
     Args:
         sweep: the shown sweep.
-        requested: the sweep with the branches in its file; `sweep` has existing branches instead.
+        requested: the sweep as in its file; in `sweep`, branches that runs lack are replaced.
         runs: the finished runs of every runnable variant, by seed.
         command: the command that makes missing runs.
         describe_run: describes the state of an unfinished run.
@@ -285,7 +285,7 @@ def _flag_diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterato
     ]
     modes = {mode for _, _, run in every for mode in run.means}
 
-    def find_clips_without_numbers(mode: str, metric: str) -> dict[tuple[str, int], set[str]]:
+    def find_clips_without_values(mode: str, metric: str) -> dict[tuple[str, int], set[str]]:
         """Return the clips without a finite number, by variant label and seed, for runs with the metric."""
         found = {}
         for variant, seed, run in every:
@@ -295,10 +295,10 @@ def _flag_diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterato
         return found
 
     for mode, metric in itertools.product(modes, set(sweep.metrics) - set(COSTS)):
-        lacking = find_clips_without_numbers(mode, metric)
+        lacking = find_clips_without_values(mode, metric)
         if any(lacking.values()):
             short = set.intersection(*lacking.values())
-            short = short.difference(*find_clips_without_numbers(mode, SHARED_METRIC).values())
+            short = short.difference(*find_clips_without_values(mode, SHARED_METRIC).values())
             for cell, clips in lacking.items():
                 lost[cell] |= clips - short
     found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
@@ -453,11 +453,13 @@ def _flag_missing_replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> It
             interval = "no interval" if one_group else "an interval about other clips alone"
             yield f"one seed, so {interval}, and nothing is significant: {join_quoted(few)}"
 
-    def count_single_clips(run: MeasuredRun) -> int:
+    def count_groups_of_one_clip(run: MeasuredRun) -> int:
         return list(Counter(map(run.get_group, run.clips)).values()).count(1)
 
-    if not one_group and all(count_single_clips(run) >= UNGROUPED_FRACTION * len(run.clips) for run in every):
-        alone, clips = min((count_single_clips(run), len(run.clips)) for run in every if run.clips)
+    if not one_group and all(
+        count_groups_of_one_clip(run) >= UNGROUPED_FRACTION * len(run.clips) for run in every
+    ):
+        alone, clips = min((count_groups_of_one_clip(run), len(run.clips)) for run in every if run.clips)
         each = f"{alone} of {clips} test clips are groups of their own"
         each = "each test clip is a group of its own" if alone == clips else each
         yield f"{each} (data.split.groups): right if no two share a person"

@@ -204,7 +204,7 @@ class MeasuredRun:
 
     @property
     def has_one_branch(self) -> bool:
-        """Whether the network predicts only rotations.
+        """Whether the network predicts only rotations, judged by its errors.
 
         Then forward kinematics computes the positions, and both branches have equal errors. Clips on which
         the network diverged are ignored.
@@ -264,7 +264,7 @@ def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> Meas
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     deployed = (deployments or [run.deployment_as_configured])[-1]
     latency = deployed.record
-    origin = _add_evaluations(_add_prerequisites(_read_origin(manifest), run), reports)
+    origin = _add_evaluations(_join_prerequisite_origins(_read_origin(manifest), run), reports)
     origin = replace(origin, deployed=find_deployed_precision(latency))
     origin = replace(
         origin,
@@ -371,7 +371,7 @@ def _read_code_digests(manifest: Mapping[str, Any]) -> dict[str, str]:
     return {name: _join_unique([own[name], *(one[name] for one in others if name in one)]) for name in own}
 
 
-def _add_prerequisites(origin: Origin, run: Run) -> Origin:
+def _join_prerequisite_origins(origin: Origin, run: Run) -> Origin:
     prerequisite = get_recorded_prerequisites(run.manifest)
     digests: dict[str, list[str]] = defaultdict(list)
     for one in prerequisite:

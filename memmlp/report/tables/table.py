@@ -223,7 +223,7 @@ class Table:
     def find_detectable(self, mode: str, metric: str) -> float | None:
         """Return the smallest difference that every comparison detects with 80 % power; None if unknown.
 
-        Blind comparisons are left out (`list_blind_variants`).
+        Comparisons that cannot detect anything are left out (`list_blind_variants`).
         """
         known = [effect.detectable for _, name, _, effect in self.list_effects(mode) if name == metric]
         return max((one for one in known if one is not None), default=None)

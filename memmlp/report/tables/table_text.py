@@ -228,7 +228,7 @@ def format_counts(counts: Counter[Verdict]) -> str:
 def _make_lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
     """Yield a variant's lines: measured values, differences from the control, and the paper's values."""
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
-    paper = tuple((format_paper(cell, metric),) for cell, metric in cells)
+    paper = tuple((format_paper_value(cell, metric),) for cell, metric in cells)
     if row.is_paper_only:
         yield ((row.label,), ("paper",), *paper)
         return
@@ -343,7 +343,7 @@ def count_interval_decimals(width: float, least: int = 2) -> int:
     return min(max(1 - math.floor(math.log10(width / 2)), least), least + 1) if width > 0 else least
 
 
-def format_paper(cell: Cell, metric: str) -> str:
+def format_paper_value(cell: Cell, metric: str) -> str:
     """Return the paper's value, its difference from the control, and ✓ or ✗ if measured results decide."""
     if cell.paper is None:
         return MISSING

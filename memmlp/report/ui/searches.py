@@ -35,7 +35,7 @@ class Searches:
         stamps = {path.name: _find_change_time(path) for path in self.outputs.glob("tune/*/")}
         return sorted(filter(stamps.get, stamps), key=lambda name: -stamps[name])
 
-    def make_stamp(self) -> str:
+    def make_change_stamp(self) -> str:
         """Return a text that changes when any search changes."""
         return repr([(name, _find_change_time(self.outputs / "tune" / name)) for name in self.list_names()])
 

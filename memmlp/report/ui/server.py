@@ -92,7 +92,7 @@ class Answers:
         with self.lock:
             started = time.thread_time()
             if time.monotonic() >= self.next_look or (self.index.unread and seconds == math.inf):
-                stamps = self.index.refresh(seconds), self.sweeps.refresh(), self.searches.make_stamp()
+                stamps = self.index.refresh(seconds), self.sweeps.refresh(), self.searches.make_change_stamp()
                 self.places = self.list_places()
                 self.state = f"{self.rows.update(self.places)}-{digest(stamps[1:])[:8]}"
                 pause = min(max(self.pause, 15 * (time.thread_time() - started)), MAX_PAUSE)

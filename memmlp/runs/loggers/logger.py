@@ -66,7 +66,7 @@ class RunFacts:
 
 
 def read_run_facts(run: Run, running: bool = False) -> RunFacts:
-    """Read the facts of a run that has started; its final state unless it is `running`."""
+    """Read the facts of a run that has started, and its final state if it has ended."""
     run.check_records()
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     failure, finished = records.read(run.folder / "FAILED", records.Failure), manifest.get("finished")

@@ -199,7 +199,7 @@ def read_objectives(objectives: Sequence[Objective], run: Run) -> list[float]:
     return [objective.value(kept.values) for objective in objectives]
 
 
-def direct_search(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:
+def run_search(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:
     """Run the search: keep the fleet working until the study has all of its trials.
 
     The plan is written to `path`, which the workers read. The file is touched repeatedly to show that the

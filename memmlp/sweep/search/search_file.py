@@ -318,8 +318,8 @@ def _parse_term(part: str, text: str) -> tuple[float, str]:
     if match is None or metric not in UNITS or branch not in OBJECTIVE_BRANCHES:
         names, branches = ", ".join(UNITS), " or ".join(OBJECTIVE_BRANCHES)
         raise InputError(
-            f"search.objectives: '{text}'; expected a sum of terms [WEIGHT*][{branches}] METRIC "
-            f"with METRIC one of {names}"
+            f"search.objectives: '{text}'; must be a sum of terms such as '0.5 * position MPJPE'; weight "
+            f"and branch ({branches}) may be omitted, METRIC is one of {names}"
         )
     if metric in HIGHER:
         raise InputError(

@@ -26,11 +26,11 @@ def test_a_search_in_a_custom_storage_is_read_again(folder: Path, tmp_path: Path
     plan = folder / "controllers/a.json"
     one.update(1).save(plan)
     assert searches.describe("mine")["counts"] == {"running": 1}
-    before = searches.make_stamp()
+    before = searches.make_change_stamp()
     finish(one.update(1))
     one.update(1).save(plan)
     assert searches.describe("mine")["counts"] == {"complete": 1, "running": 1}
-    assert searches.make_stamp() != before
+    assert searches.make_change_stamp() != before
 
 
 @pytest.mark.parametrize("changes", [{"storage": 5}, {"name": []}, {"objectives": None}, {"space": [[]]}])
