@@ -193,7 +193,8 @@ class ProductQuantiser(nn.Module):
         self.usage.lerp_(share, 1 - DECAY)
         weight = torch.exp(-self.usage * (BOOKS * CODES * 10) / (1 - DECAY) - 1e-3)[..., None]
         nearest = parts.gather(1, distance.argmin(1)[..., None].expand(-1, -1, parts.shape[-1]))
-        self.vectors.data.lerp_(nearest, weight)  # .data: the losses' gradients are those of before
+        # not in place: the losses' gradients are those of before
+        self.vectors.data = self.vectors.data.lerp(nearest, weight)
 
 
 def compute_contrast(distance: Tensor) -> Tensor:

@@ -99,6 +99,8 @@ class AdamWSettings(OptimSettings):
     # null: no average
     ema: float | None = setting(within(0, 1, strict=True), "${profile.ema}")
     eps: float | None = setting(positive(), None)  # Adam's epsilon; null: 1e-8
+    # false: weight decay is part of the gradient, as in Adam; null or true: AdamW
+    decoupled: bool | None = setting(None, None)
 
 
 @component("optim", "muon", builds="Muon")
@@ -142,7 +144,7 @@ class Optim:
     ema: float | None = None
     weight_decay: float = 1e-4
     betas: tuple[float, float] = (0.9, 0.999)
-    decoupled: bool = True
+    decoupled: bool | None = True
     clip_norm: float = 0.0
     precision: str = "fp32"
     compile: bool = False
@@ -197,7 +199,7 @@ class Optim:
 
     def build_adam(self, groups: list[dict]) -> Optimizer:
         """Make Adam or AdamW for parameter groups."""
-        kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
+        kind = torch.optim.Adam if self.decoupled is False else torch.optim.AdamW
         eps = self.eps or 1e-8
         return kind(groups, self.lr, self.betas, eps, weight_decay=self.weight_decay, fused=True)
 

@@ -66,7 +66,7 @@ class SAGEPartSettings:
     lr_drop: float = setting(positive(), 0.25)  # factor of the learning rate at each drop
 
 
-@component("prerequisite", "sage", version=3)
+@component("prerequisite", "sage", version=4)
 @dataclass
 class SAGEPrerequisiteSettings(Settings):
     """The training of SAGE-Net's parts in separate runs, before the whole network (Feng et al. 2024).

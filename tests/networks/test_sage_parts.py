@@ -1,5 +1,7 @@
 """SAGE-Net's networks: published sizes, shapes, the quantiser."""
 
+import copy
+
 import pytest
 import torch
 
@@ -42,3 +44,11 @@ def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through(
     assert float((quantiser.vectors - before).detach().norm(dim=-1).median()) > 10
     loss.backward()
     assert quantiser.vectors.grad.any()
+
+
+def test_gradients_are_those_of_the_codes_before_they_move():
+    quantiser, z = sage_parts.ProductQuantiser(), (0.02 * torch.randn(4, 16, 384)).requires_grad_()
+    unmoved = copy.deepcopy(quantiser)
+    unmoved.move_unused_codes = lambda *_: None
+    (found,), (expected,) = (torch.autograd.grad(one(z)[1], z) for one in (quantiser, unmoved))
+    torch.testing.assert_close(found, expected)

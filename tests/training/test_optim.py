@@ -91,6 +91,7 @@ def test_muon_has_the_matrices_and_adamw_the_rest():
     assert [group["params"] for group in muon.param_groups] == [[matrix]]
     assert [group["params"] for group in adamw.param_groups] == [[row], [cube]]
     assert [group["eps"] for group in adamw.param_groups] == [1e-6, 1e-6]
+    assert type(replace(OPTIMS["ema"], decoupled=False).build([{"params": [row]}])) is torch.optim.Adam
     assert [group["lr"] for group in optimiser.param_groups] == [1e-2, 0.5, 0.1]
     assert [group["weight_decay"] for group in optimiser.param_groups] == [1e-4, 1e-4, 0]
 
