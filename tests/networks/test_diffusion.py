@@ -11,13 +11,6 @@ from memmlp.networks import diffusion as module
 from memmlp.networks.diffusion import AncestralDiffusion, DenoiserOutput, Diffusion
 
 
-def test_cosine_schedule_is_the_papers():
-    signal = module.make_cosine_schedule(1000).numpy()
-    level = np.cos((np.arange(1001) / 1000 + 0.008) / 1.008 * np.pi / 2) ** 2
-    np.testing.assert_allclose(signal[:-1], (level / level[0])[1:-1], rtol=1e-9)
-    assert signal[-1] == pytest.approx(signal[-2] * 0.001)
-
-
 @pytest.mark.parametrize("steps", [1, 3, 5])
 def test_ddim_is_an_independent_numpy_computation(steps):
     """The denoiser is an affine map of the noisy signal and the time."""

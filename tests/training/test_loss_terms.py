@@ -130,8 +130,6 @@ def test_released_columns_are_not_made_orthonormal():
     assert terms(long, columns="released", global_rotation=1.0)["global_rotation"] == pytest.approx(expected)
     usual, released = (terms(long, columns=one, world_position=1.0) for one in (None, "released"))
     assert usual == terms(world_position=1.0) != released
-    sound = terms(columns="released", world_position=1.0)
-    assert sound == pytest.approx(terms(world_position=1.0), rel=1e-5)
 
 
 def test_every_term_reaches_the_rotations():
