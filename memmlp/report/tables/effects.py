@@ -12,6 +12,7 @@ import numpy as np
 
 from memmlp.report.tables.measured_run import SHARED_METRIC, MeasuredRun, select_runs_for_metric
 from memmlp.report.tables.statistics import (
+    compute_bootstrap_p,
     compute_detectable,
     compute_equivalence_p,
     correct_by_holm,
@@ -212,7 +213,7 @@ def estimate_effects(
     Args:
         pairs: the differences.
         smallest: the smallest effect of interest by metric.
-        sensitivity: whether to compute detectable effects, which doubles the time.
+        sensitivity: whether to compute detectable effects and bootstrap p-values, which take the most time.
     """
     found: dict[Key, Effect] = {}
     comparisons = max(1, count_testable(pairs))
@@ -227,10 +228,12 @@ def estimate_effects(
         same = compute_equivalence_p(differences, margins, groups)
         nothing = np.full(len(keys), np.nan)
         seen = compute_detectable(differences, comparisons, groups) if sensitivity else nothing
+        second = compute_bootstrap_p(differences, groups) if sensitivity else nothing
         numbers = estimate_paired_effects(differences, groups)
-        columns = zip(keys, *numbers[:4], same, seen, strict=True)
-        for key, mean, low, high, p, equal, least in columns:
-            values, tested = {"low": low, "high": high}, {"p": p, "equal": equal, "detectable": least}
+        columns = zip(keys, *numbers[:4], second, same, seen, strict=True)
+        for key, mean, low, high, p, other, equal, least in columns:
+            values = {"low": low, "high": high}
+            tested = {"p": p, "bootstrap": other, "equal": equal, "detectable": least}
             values |= tested if pairs[key].is_testable else {}
             known: dict[str, Any] = {name: convert_nan_to_none(number) for name, number in values.items()}
             found[key] = Effect(float(mean), **known, **size)
@@ -305,14 +308,21 @@ def _add_verdicts(
     Holm's correction treats differences and equivalences as separate families of p-values.
     """
     keys = list(tested)
+    p, second, equal = (
+        np.array([convert_none_to_nan(getattr(tested[key], name)) for key in keys])
+        for name in ("p", "bootstrap", "equal")
+    )
+    # Comparisons without a bootstrap p-value still count in its correction.
+    corrected_second = correct_by_holm(np.where(np.isnan(second), p, second))
     families = (
-        correct_by_holm(np.array([convert_none_to_nan(getattr(tested[key], name)) for key in keys]))
-        for name in ("p", "equal")
+        correct_by_holm(p),
+        np.where(np.isnan(second), np.nan, corrected_second),
+        correct_by_holm(equal),
     )
     judged = {}
-    for key, p, q in zip(keys, *families, strict=True):
-        verdict = decide_verdict(float(p), float(q), tested[key].mean, printed.get(key))
-        corrected = {"holm": p, "equal": q}
+    for key, *corrected_p in zip(keys, *families, strict=True):
+        corrected = dict(zip(("holm", "bootstrap", "equal"), map(float, corrected_p), strict=True))
+        verdict = decide_verdict(corrected["holm"], corrected["equal"], tested[key].mean, printed.get(key))
         numbers: dict[str, Any] = {name: convert_nan_to_none(one) for name, one in corrected.items()}
         judged[key] = replace(tested[key], **numbers, verdict=verdict)
     return judged

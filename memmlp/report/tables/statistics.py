@@ -31,6 +31,8 @@ from scipy.special import chdtri, ndtri, stdtr, stdtrit
 
 LEVEL = 0.05
 DRAWS = 4096  # number of simulated tables; Sobol's sequence needs a power of two
+RESAMPLES = 1 << 16  # number of simulated comparisons of a bootstrap p-value
+FEW_GROUPS = 30  # maximum number of clip groups for a bootstrap p-value
 
 Groups = np.ndarray | Sequence[object] | None
 """The group of each clip (C,), as integers or labels; None if each clip forms a separate group."""
@@ -203,6 +205,55 @@ def estimate_paired_effects(differences: np.ndarray, groups: Groups = None) -> E
     nothing = np.full_like(mean, np.nan)
     p = nothing if known.unreplicated else known.compute_significance_level(np.abs(mean))
     return EffectEstimates(mean, *estimate_interval(differences, groups), p, known.unreplicated)
+
+
+def compute_bootstrap_p(differences: np.ndarray, groups: Groups = None) -> np.ndarray:
+    """Return p-values (K,) by a parametric bootstrap, from differences (K, S, C) and groups (C,).
+
+    The interval must be safe for any ratio of seed effects and group effects, so its p-values are often
+    larger than needed. The bootstrap p-value is the probability of a p-value this small without an effect, if
+    A and B are the true variances: the larger one for normal and for exponential group effects. A and B both
+    contain the noise, which therefore counts twice. P-values are NaN with a single seed, with a single group
+    or with more than FEW_GROUPS groups.
+    """
+    known, (_, weights) = estimate_error(differences, groups), average_groups(differences[:1], groups)
+    if known.unreplicated or len(weights) > FEW_GROUPS:
+        return np.full(len(differences), np.nan)
+    levels = known.compute_significance_level(np.abs(differences.mean((1, 2))))
+    seed_means, seed_variances, effects = _draw_effects(int(known.seeds) + 1, tuple(weights))
+    found = np.full(len(differences), np.nan)
+    for k in np.flatnonzero(np.isfinite(levels)):
+        a, b, _ = known.variances[:, k]
+        seeds, heavy = (
+            _square_quantile(df, levels[k]) * variance
+            for df, variance in ((known.seeds, a), (reduce_freedom(known.groups), b))
+        )
+        counts = [
+            np.sum(
+                (np.sqrt(a) * seed_means + np.sqrt(b) * means) ** 2
+                >= seeds * seed_variances + heavy * variances
+            )
+            for means, variances in effects
+        ]
+        found[k] = (max(counts) + 1) / (RESAMPLES + 1)
+    return found
+
+
+@functools.cache
+def _draw_effects(
+    seeds: int, weights: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+    """Draw seed effects and group effects that give a mean the variance 1.
+
+    Returns:
+        The means of the seed effects and the estimates of their variance, (RESAMPLES,) each; the same of
+        group effects, normal and exponential.
+    """
+    rng, share, size = np.random.default_rng(0), np.array(weights), (RESAMPLES, len(weights))
+    scale = np.sqrt(share @ share)
+    effects = [rng.normal(size=size), rng.exponential(size=size) - 1]
+    means, variances = rng.normal(size=RESAMPLES), rng.chisquare(seeds - 1, RESAMPLES) / (seeds - 1)
+    return means, variances, [(one @ share / scale, one.var(1, ddof=1)) for one in effects]
 
 
 def estimate_interval(values: np.ndarray, groups: Groups = None) -> tuple[np.ndarray, np.ndarray]:

@@ -32,6 +32,7 @@ class Effect:
         low, high: its 95 % interval.
         p: its p-value, not corrected.
         holm: its p-value, corrected for all comparisons in the table.
+        bootstrap: its bootstrap p-value, corrected; None with more than FEW_GROUPS groups.
         equal: the corrected p-value of equivalence (see `memmlp.report.tables.statistics`).
         verdict: the verdict.
         detectable: the smallest difference that this comparison detects with 80 % power.
@@ -46,6 +47,7 @@ class Effect:
     high: float | None = None
     p: float | None = None
     holm: float | None = None
+    bootstrap: float | None = None
     equal: float | None = None
     verdict: Verdict | None = None
     detectable: float | None = None

@@ -14,12 +14,11 @@ from memmlp.common.files import make_json_safe
 from memmlp.common.text_formats import escape_latex, escape_markdown
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.tables.flags import join_quoted
-from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.statistics import FEW_GROUPS, Verdict
 from memmlp.report.tables.table import MAX_TIME_RATIO, Cell, Effect, Row, Table
 from memmlp.sweep.definition import COSTS
 
 COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB"}
-FEW_GROUPS = 30  # maximum number of clip groups at which p-values are printed
 MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
 CONFOUNDED = "‡"  # mark of a row that differs from its control in more than its label names
@@ -300,6 +299,8 @@ def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
     p: tuple[str, ...] = ()
     if effect.holm is not None and 0 < effect.groups <= FEW_GROUPS:
         p = (f"p {format_significant(effect.holm, 2)}",)
+    if effect.bootstrap is not None:
+        p += (f"bootstrap {format_significant(effect.bootstrap, 2)}",)
     return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict, *p
 
 

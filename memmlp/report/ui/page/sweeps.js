@@ -176,7 +176,8 @@ function cell({ mean, sd, effect, paper, paper_effect: paperEffect, counted, cli
     h('span', { class: 'strong' }, mean === null ? DASH : metricNumber(metric, mean), sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(sd, mean >= 1000 ? 0 : decimals(mean))}`), counted < clips ? h('small', { class: 'faint' }, ` (${counted} of ${clips} clips)`) : null),
     effect && h('span', { class: significant(effect) ? 'strong' : '' }, signed(effect.mean, digits), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`)),
     effect?.verdict && [h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null,
-      effect.holm === null || !(effect.groups <= 30) ? null : h('small', { class: 'faint' }, ` p ${number(Number(effect.holm.toPrecision(2)))}`)],
+      effect.holm === null || !(effect.groups <= 30) ? null : h('small', { class: 'faint' }, ` p ${number(Number(effect.holm.toPrecision(2)))}`),
+      effect.bootstrap == null ? null : h('small', { class: 'faint' }, ` bootstrap ${number(Number(effect.bootstrap.toPrecision(2)))}`)],
     paper !== null && h('small', { class: 'faint' }, `paper ${number(paper)}`, paperEffect === null ? null : ` (${signed(paperEffect)})`),
   ];
 }
