@@ -14,7 +14,12 @@ from fake_table import EFFECTS, cell, printed
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.effects import compute_effects, compute_mean_cost
 from memmlp.report.tables.measured_run import load_measured_run
-from memmlp.report.tables.statistics import Verdict, correct_by_holm, estimate_paired_effects
+from memmlp.report.tables.statistics import (
+    Verdict,
+    compute_bootstrap_p,
+    correct_by_holm,
+    estimate_paired_effects,
+)
 from memmlp.report.tables.table_text import make_legend
 from memmlp.sweep.definition import COSTS, Sweep
 
@@ -105,11 +110,12 @@ def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
         effect = cell(table, label, metric, mode).effect
         expected = (known.mean[0], known.low[0], known.high[0])
         assert (effect.mean, effect.low, effect.high) == pytest.approx(expected)
-        p[label, mode, metric] = known.p[0]
-    corrected = dict(zip(p, correct_by_holm(np.array(list(p.values()))), strict=True))
-    for (label, mode, metric), value in corrected.items():
+        p[label, mode, metric] = known.p[0], compute_bootstrap_p((one - control)[None])[0]
+    both = np.transpose([correct_by_holm(kind) for kind in np.transpose(list(p.values()))])
+    corrected = dict(zip(p, both, strict=True))
+    for (label, mode, metric), (value, second) in corrected.items():
         effect = cell(table, label, metric, mode).effect
-        assert effect.holm == pytest.approx(value)
+        assert (effect.holm, effect.bootstrap) == pytest.approx((value, second))
         decided = (Verdict.HOLDS, Verdict.OPPOSITE, Verdict.HIGHER, Verdict.LOWER)
         assert (effect.verdict in decided) == (value <= 0.05 and not effect.equal <= 0.05)
     assert cell(table, "no | memory", "Jitter").effect.verdict == Verdict.EQUIVALENT

@@ -33,8 +33,8 @@ FORMATTED = [  # seeds' values, effect, metric, and their texts
     # a star has a digit beside it
     ({0: 8.0}, Effect(0.0004, low=0.0001, high=0.0007, holm=0.01), "MPJPE", "8.00",
      ("+0.0004*", "[0.0001, 0.0007]")),
-    ({0: 8.0}, Effect(0.0004, low=-0.0001, high=0.0009, holm=0.3), "MPJPE", "8.00",
-     ("+0.000", f"[{MINUS}0.000, 0.001]")),
+    ({0: 8.0}, Effect(0.0004, low=-0.0001, high=0.0009, holm=0.3, bootstrap=0.123, groups=9), "MPJPE", "8.00",
+     ("+0.000", f"[{MINUS}0.000, 0.001]", "p 0.3", "bootstrap 0.12")),
     # large costs and their differences have no exponent
     ({0: 1234.5}, Effect(0.0), "FPS", "1234", None),
     ({0: 2500.0}, Effect(1500.0), "FPS", "2500", ("+1500", "(x 2.5)")),
