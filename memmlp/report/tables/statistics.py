@@ -27,7 +27,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri, ndtri, stdtr, stdtrit
+from scipy.special import chdtri, gammaincinv, ndtri, stdtr, stdtrit
 
 LEVEL = 0.05
 DRAWS = 4096  # number of simulated tables; Sobol's sequence needs a power of two
@@ -212,7 +212,8 @@ def compute_bootstrap_p(differences: np.ndarray, groups: Groups = None) -> np.nd
 
     The interval must be safe for any ratio of seed effects and group effects, so its p-values are often
     larger than needed. The bootstrap p-value is the probability of a p-value this small without an effect, if
-    A and B are the true variances: the larger one for normal and for exponential group effects. A and B both
+    A and B are the true variances: the larger one for normal and for exponential group effects. Few seeds may
+    understate A, so its upper confidence limit counts, too, with an error probability of p. A and B both
     contain the noise, which therefore counts twice. P-values are NaN with a single seed, with a single group
     or with more than FEW_GROUPS groups.
     """
@@ -224,15 +225,12 @@ def compute_bootstrap_p(differences: np.ndarray, groups: Groups = None) -> np.nd
     found = np.full(len(differences), np.nan)
     for k in np.flatnonzero(np.isfinite(levels)):
         a, b, _ = known.variances[:, k]
-        seeds, heavy = (
-            _square_quantile(df, levels[k]) * variance
-            for df, variance in ((known.seeds, a), (reduce_freedom(known.groups), b))
-        )
+        light = _square_quantile(known.seeds, levels[k]) * seed_variances
+        heavy = _square_quantile(reduce_freedom(known.groups), levels[k])
+        limit = known.seeds / (2 * gammaincinv(known.seeds / 2, max(levels[k], 1e-12)))
         counts = [
-            np.sum(
-                (np.sqrt(a) * seed_means + np.sqrt(b) * means) ** 2
-                >= seeds * seed_variances + heavy * variances
-            )
+            np.sum((np.sqrt(c) * seed_means + np.sqrt(b) * means) ** 2 >= c * light + b * heavy * variances)
+            for c in (a, a * max(limit, 1))
             for means, variances in effects
         ]
         found[k] = (max(counts) + 1) / (RESAMPLES + 1)
