@@ -456,10 +456,13 @@ def _flag_missing_replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> It
     def count_groups_of_one_clip(run: MeasuredRun) -> int:
         return list(Counter(map(run.get_group, run.clips)).values()).count(1)
 
-    if not one_group and all(
-        count_groups_of_one_clip(run) >= UNGROUPED_FRACTION * len(run.clips) for run in every
+    measured_runs = [run for run in every if run.clips]
+    if (
+        not one_group
+        and measured_runs
+        and all(count_groups_of_one_clip(run) >= UNGROUPED_FRACTION * len(run.clips) for run in measured_runs)
     ):
-        alone, clips = min((count_groups_of_one_clip(run), len(run.clips)) for run in every if run.clips)
+        alone, clips = min((count_groups_of_one_clip(run), len(run.clips)) for run in measured_runs)
         each = f"{alone} of {clips} test clips are groups of their own"
         each = "each test clip is a group of its own" if alone == clips else each
         yield f"{each} (data.split.groups): right if no two share a person"

@@ -84,7 +84,17 @@ def _shorten_run_page(page: Mapping[str, Any]) -> dict[str, Any]:
     """Keep only the clips with the largest errors on a run's page, and shorten the manifest."""
     manifest = {key: value for key, value in page["manifest"].items() if not key.startswith(LONG_FACTS)}
     clips = sorted(page["clips"], key=_find_sort_error, reverse=True)[:MAX_CLIPS]
+    clips = [_shorten_clip(clip) for clip in clips]
     return {**page, "clips": clips, "manifest": manifest, "log": page["log"][-MAX_LOG:], "patch": ""}
+
+
+def _shorten_clip(clip: Mapping[str, Any]) -> dict[str, Any]:
+    """Keep the errors that a run's page shows: the rotation branch of its first mode, and others' MPJPE."""
+    first, *others = [mode for mode in MODES if mode in clip] or [""]
+    shown = {mode: {"rotation": {"MPJPE": clip[mode].get("rotation", {}).get("MPJPE")}} for mode in others}
+    if first:
+        shown[first] = {"rotation": clip[first].get("rotation", {})}
+    return {**{key: value for key, value in clip.items() if key not in MODES}, **shown}
 
 
 def _find_sort_error(clip: Mapping[str, Any]) -> float:
