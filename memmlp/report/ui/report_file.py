@@ -14,8 +14,8 @@ from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
 MAX_POINTS = 120  # approximate maximum number of points of a curve
-MAX_LOG = 2000  # characters of a run's log
-MAX_CLIPS = 60  # maximum number of clips of a run
+MAX_LOG = 1000  # characters of a run's log
+MAX_CLIPS = 40  # maximum number of clips of a run
 MAX_REPLAYS = 4  # maximum number of replays
 REPLAY_SECONDS = 4
 ERROR = "stream.rotation.MPJPE"  # metric that selects a sweep's best run

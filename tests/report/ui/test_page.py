@@ -214,6 +214,46 @@ def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     go(browser, file.as_uri(), "search/mine", f"{count('.plot svg')} >= 6")
 
 
+def test_views_pins_scatter_axes_tags_notes_archive_and_commands(browser: Browser, tmp_path: Path):
+    make_outputs(tmp_path)
+    run = run_of(tmp_path)
+    choose = (
+        "(s => { s.value = '%s'; s.dispatchEvent(new Event('change')); })("
+        "[...document.querySelectorAll('label')].find(l => l.textContent.startsWith('%s'))"
+        ".querySelector('select'))"
+    )
+    fill = "document.querySelector('dialog input, dialog textarea').value = '{}'"
+    with RunsServer(Answers(tmp_path, predict, 0.05, lambda run: "memmlp train x"), 0) as running:
+        go(browser, running.url, "runs?filter=seed=0", f"{count('.runs tbody tr')} == 2")
+        browser.value(choose % ("window.rotation.MPJPE", "Pin"))
+        browser.value(choose % ("stream.rotation.MPJPE", "Scatter"))
+        browser.wait(f"{LABEL}?.startsWith('stream MPJPE [cm] by ')")
+        browser.value(PRESS.format(".tools", "Save view"))
+        browser.value(fill.format("Ours"))
+        browser.click("dialog .primary")
+        browser.wait("document.querySelector('.tools').textContent.includes('Ours')")
+        go(browser, running.url, "runs", f"{count('.runs tbody tr')} == 6")
+        browser.value(choose % ("Ours", "View"))
+        browser.wait(
+            f"{count('.runs tbody tr')} == 2 && {texts('.runs thead button')}.includes('MPJPEwindow, cm')"
+        )
+        go(browser, running.url, f"run/{run.id}", f"{count('.plot svg')} >= 1")
+        for axis, unit in (("time", "hours"), ("samples", "samples")):
+            browser.value(choose % (axis, "Over"))
+            browser.wait(f"document.querySelector('.curves [role=img]').ariaLabel.includes('by {unit}.')")
+        for button, value, shown in (("Tags", "good", ".tag"), ("Note", "look", ".remark")):
+            browser.value(PRESS.format(".picked", button))
+            browser.value(fill.format(value))
+            browser.click("dialog .primary")
+            browser.wait(f"document.querySelector('{shown}')?.textContent == '{value}'")
+        browser.value(PRESS.format(".picked", "Command"))
+        browser.wait("document.querySelector('dialog textarea')?.value == 'memmlp train x'")
+        browser.value(PRESS.format("dialog", "Cancel"))
+        browser.value(PRESS.format(".picked", "Archive"))
+        browser.wait(f"{texts('.picked button')}.includes('Restore')")
+        go(browser, running.url, "runs", f"{count('.runs tbody tr')} == 5")
+
+
 def test_daily_work_groups_baseline_csv_and_changes(browser: Browser, tmp_path: Path):
     make_outputs(tmp_path)
     new = started_run(tmp_path)
