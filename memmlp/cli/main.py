@@ -13,7 +13,7 @@ import click
 
 import memmlp
 from memmlp.common import distributed
-from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged, is_interruption
 from memmlp.common.processes import collect_garbage_rarely, treat_termination_as_interrupt
 from memmlp.common.progress import send_announcements_to
 from memmlp.common.text_formats import print_in_any_encoding
@@ -132,7 +132,7 @@ def _run_command_line(arguments: list[str]) -> None:
 
 def _choose_exit_code(error: Exception) -> int | None:
     """Return the exit code for an expected error; None for a bug, which needs its traceback."""
-    if isinstance(error, click.Abort):  # click raises it for Ctrl-C
+    if isinstance(error, click.Abort) or is_interruption(error):  # click raises Abort for Ctrl-C
         return INTERRUPTED
     if isinstance(error, click.ClickException):
         return error.exit_code
@@ -140,10 +140,7 @@ def _choose_exit_code(error: Exception) -> int | None:
         return 2 if error.filename else 1  # 2 for a path from the user, 1 for a full or failing disk
     if type(error) in (InputError, TrainingDiverged, LeaseLost, RunStopped):
         return 2 if type(error) is InputError else 1
-    cause: BaseException | None = error  # may follow from a Ctrl-C, for example during an import
-    while cause is not None and not isinstance(cause, KeyboardInterrupt):
-        cause = cause.__cause__ or cause.__context__
-    return None if cause is None else INTERRUPTED
+    return None
 
 
 def _format_error(error: Exception, arguments: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ import hydra
 from omegaconf import DictConfig
 
 from memmlp.common import distributed
-from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged, is_interruption
 from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import parse_overrides
 from memmlp.config.check import explain_error
@@ -116,7 +116,7 @@ def _collect_failures(
         try:
             job(cfg)
         except (InputError, TrainingDiverged, LeaseLost, RunStopped, OSError) as failure:
-            if os.getpid() != collector:
+            if os.getpid() != collector or is_interruption(failure):
                 raise
             failures.append(failure)
 

@@ -64,3 +64,12 @@ class LeaseLost(RuntimeError):
 def is_disk_error(error: Exception) -> bool:
     """Return whether the disk is full or read-only; then the run itself did not fail."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+def is_interruption(error: BaseException) -> bool:
+    """Return whether an error is, or follows from, a Ctrl-C or SIGTERM. Libraries report an interrupted
+    import or composition as their own failure."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause is not None

@@ -22,7 +22,7 @@ from memmlp.common.components import (
     find_chosen_settings,
     find_component,
 )
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, is_interruption
 from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import flatten, format_value
 from memmlp.common.text_formats import escape_interpolations, make_override
@@ -314,7 +314,9 @@ def make_readable_name(kind: str, config: Mapping[str, Any]) -> str:
     words += ["published weights"] if config.get("imported_weights") else []
     try:
         words += _list_differences(config)
-    except (HydraException, OmegaConfBaseException):  # the run must not fail because of its name
+    except (HydraException, OmegaConfBaseException) as error:  # the run must not fail because of its name
+        if is_interruption(error):
+            raise
         words.append("own config")
     if len(words) > MAX_WORDS:
         words = [*words[:MAX_WORDS], f"{len(words) - MAX_WORDS} more"]

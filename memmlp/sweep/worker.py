@@ -12,7 +12,14 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged, is_disk_error
+from memmlp.common.errors import (
+    InputError,
+    LeaseLost,
+    RunStopped,
+    TrainingDiverged,
+    is_disk_error,
+    is_interruption,
+)
 from memmlp.common.files import read_json, write_json
 from memmlp.common.lease import ChangeTimer, current_process, is_alive
 from memmlp.runs.run import Run
@@ -99,17 +106,18 @@ def _finish_run(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
         pass
     except RunStopped:
         run.reset_deaths()
-    except KeyboardInterrupt:
-        run.reset_deaths()  # a scheduler may interrupt a run any number of times
-        raise
     except (LeaseLost, BrokenPipeError):  # whoever read the worker's output has died
         raise
-    except (InputError, TrainingDiverged) as error:
-        run.fail(str(error))
-    except Exception as error:
+    except (KeyboardInterrupt, Exception) as error:
+        if is_interruption(error):
+            run.reset_deaths()  # a scheduler may interrupt a run any number of times
+            raise KeyboardInterrupt from error
         if is_disk_error(error):
             raise
-        run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
+        if isinstance(error, InputError | TrainingDiverged):
+            run.fail(str(error))
+        else:
+            run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
 def count_deaths(run: Run) -> int:

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from memmlp.common import distributed
-from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_disk_error
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_disk_error, is_interruption
 from memmlp.common.files import write_json
 from memmlp.common.progress import announce, keep_announcements, notify
 from memmlp.deploy.deployment import Deployment
@@ -221,7 +221,7 @@ def record_outcome(experiment: Experiment, run: Run, again: bool = False) -> Ite
             run.fail(str(error))
             raise
         except (RuntimeError, OSError) as error:
-            if not is_disk_error(error):
+            if not is_disk_error(error) and not is_interruption(error):
                 run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
             raise
         run.reset_deaths()

@@ -1,8 +1,6 @@
 """`memmlp export`: what it rejects, what it copies, and a file in fp16 for Unity."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -34,24 +32,6 @@ def test_an_offline_network_has_no_file():
     for graph in ("auto", "naive"):
         with pytest.raises(InputError, match=r"model\.offline=true"):
             module.load(SimpleNamespace(network=lambda: model), ExportForm(graph, "fp32", 18, None))
-
-
-@pytest.mark.slow
-def test_a_deployed_file_is_copied_without_torch(home: Path, tmp_path: Path):
-    run = find_trained(home)
-    code = (
-        "import sys; from memmlp.cli.main import main\n"
-        "try: main(sys.argv[1:])\n"
-        "except SystemExit as end: assert not end.code, end.code\n"
-        "print(sorted({'torch', 'onnxruntime', 'hydra'} & set(sys.modules)))"
-    )
-    line = [sys.executable, "-c", code, "export", run.id, "--out", str(tmp_path / "step.onnx")]
-    ran = subprocess.run(line, cwd=home, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
-    deployed = run.preferred_deployment
-    assert f"differs from torch by at most {deployed.record['onnx_parity']:.1e}" in ran.stdout
-    assert ran.stdout.endswith("[]\n")
-    assert (tmp_path / "step.onnx").read_bytes() == deployed.onnx.read_bytes()
 
 
 @pytest.mark.slow

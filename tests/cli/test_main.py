@@ -8,7 +8,9 @@ from unittest.mock import Mock
 
 import click
 import pytest
-from conftest import Memmlp, one_line
+from cli.conftest import find_trained
+from command_line import TINY, run
+from conftest import INT8, Memmlp, one_line
 from processes import finished
 
 from memmlp.cli.main import COMMANDS, main
@@ -90,6 +92,21 @@ def test_help_and_refusals_of_an_unknown_run_import_nothing_slow(tmp_path: Path)
     assert [(name, code) for name, code, *_ in told[1:]] == [(line[0], "2") for line in lines[1:]]
     assert not any("torch" in loaded for _, _, *loaded in told)
     assert all(f"  {name} " in ran.stdout for name in COMMANDS)
+
+
+def test_a_second_start_a_typo_and_a_second_export_import_no_torch(home: Path):
+    train = ["train", *TINY, INT8]
+    run(home, *train)  # prepares the motion of the copied folder
+    trained = find_trained(home)
+    lines = [train, [*train, "optim.stesp=6"], ["export", trained.id, "--out", "step.onnx"]]
+    ran = finished([sys.executable, "-c", f"LINES = {lines}\n{QUICK}"], cwd=home)
+    told = [line.split()[2:] for line in ran.stdout.splitlines() if line.startswith("loaded")]
+    assert [code for code, *_ in told] == ["0", "2", "0"], ran.stderr
+    assert "optim.stesp" in ran.stderr
+    deployed = trained.preferred_deployment
+    assert f"differs from torch by at most {deployed.record['onnx_parity']:.1e}" in ran.stdout
+    assert (home / "step.onnx").read_bytes() == deployed.onnx.read_bytes()
+    assert not any({"torch", "onnxruntime"} & {*loaded} for _, *loaded in told)
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

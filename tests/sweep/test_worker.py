@@ -17,6 +17,9 @@ from processes import PATIENCE, started, until
 
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.common.lease import ChangeTimer
+from memmlp.config import build, compose
+from memmlp.config.build import make_readable_name
+from memmlp.config.compose import compose_config
 from memmlp.runs.lookup import change_run
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
@@ -128,6 +131,18 @@ def test_a_cancelled_run_is_left_as_it_is(tmp_path: Path):
     work_on_plan(path, perform)
     assert Plan.load(path).get_run(ALONE).status == "interrupted"
     assert Plan.load(path).list_remaining() == []
+
+
+@pytest.mark.parametrize("work", [compose_config, lambda words: make_readable_name("memmlp", {"seed": 0})])
+def test_a_request_to_end_a_worker_is_no_config_error(tmp_path: Path, monkeypatch, work):
+    """OmegaConf reports an interruption as an error of its own."""
+    monkeypatch.setattr("omegaconf.listconfig.ListConfig._validate_set", Mock(side_effect=KeyboardInterrupt))
+    for cached in (compose._compose_options, build._compose_default):
+        cached.cache_clear()
+    trial = plan(tmp_path, ALONE)
+    with pytest.raises(KeyboardInterrupt):
+        try_task(trial, ALONE, lambda plan, task: work(["profile=tiny"]))
+    assert trial.get_run(ALONE).failure is None
 
 
 def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -164,11 +164,13 @@ def test_changed_weights_are_not_evaluated_and_what_is_exported_is_checked_on_th
     (TrainingDiverged("loss is nan"), "loss is nan"), (OSError(5, "bad disk"), "bad disk"),
     (OSError(28, "disk full"), None), (BrokenPipeError(32, "nobody reads"), None),
     (LeaseLost("taken over"), None), (InputError("data changed"), None),
-    (Cancelled("by its plan"), None), (KeyboardInterrupt(), None),
+    (Cancelled("by its plan"), None), (KeyboardInterrupt(), None), (RuntimeError("no export"), None),
 ])  # fmt: skip
 def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(tmp_path, error, failure):
     run = begun(tmp_path)
     experiment: Any = SimpleNamespace(loggers=Loggers((), tmp_path), stage_ids=(), outputs=tmp_path)
+    if type(error) is RuntimeError:
+        error.__context__ = KeyboardInterrupt()
     with pytest.raises(type(error)), record_outcome(experiment, run):
         raise error
     assert (run.failure is None) == (failure is None)

@@ -32,6 +32,8 @@ SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU
 AccountingStorageType=accounting_storage/none
 JobAcctGatherType=jobacct_gather/none
+JobCompType=jobcomp/filetxt
+JobCompLoc={folder}/jobs.txt
 MpiDefault=none
 ReturnToService=2
 KillWait=5
@@ -105,6 +107,15 @@ def end_jobs() -> None:
 
 def slurm(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+
+
+def list_ends(folder: Path) -> list[dict[str, str]]:
+    """The ended jobs by Slurm's own record, in order, each with its `name`. Its JobState is PENDING each time
+    that it was queued again."""
+    path = folder / "jobs.txt"
+    lines = path.read_text().splitlines() if path.exists() else []
+    rows = [dict(word.split("=", 1) for word in line.split() if "=" in word) for line in lines]
+    return [row | {"name": f"{row['ArrayJobId']}_{row['ArrayTaskId']}"} for row in rows]
 
 
 def list_jobs() -> dict[str, str]:
