@@ -155,7 +155,7 @@ def kill_step_and_worker(name: str) -> None:
 EVENTS: dict[str, tuple[Callable[[str], object], str]] = {
     "scancel": (lambda name: slurm("scancel", name), "CANCELLED"),
     "scontrol requeue": (lambda name: slurm("scontrol", "requeue", name), "PENDING"),
-    "kill -9 of the step and its worker": (kill_step_and_worker, "FAILED"),
+    "kill -9 of the step and its worker": (kill_step_and_worker, "CANCELLED"),  # by the controller
 }
 """What happens to a job, and its state afterwards in Slurm's record."""
 
