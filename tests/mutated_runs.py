@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import random
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import yaml
 from fake_runs import fake_run
 
-from memmlp.common.files import write_json
+from memmlp.common.files import file_digest, write_json
 from memmlp.runs.run import Run
 
 CONFIG = {
@@ -59,7 +60,8 @@ def make_run(outputs: Path, name: str) -> Run:
     sources = {f"{number}.py": "0" for number in range(200)}
     run.write_manifest(facts | {"prerequisite_runs": [part], "sources": sources})
     run.model.write_bytes(b"weights")
-    write_json(run.marker, {"id": run.id, "finished": FINISHED, "artifacts": {}})
+    artifacts = {run.model.name: file_digest(run.model)}
+    write_json(run.marker, {"id": run.id, "finished": FINISHED, "artifacts": artifacts})
     latency = run.deployment("fp32-0").latency
     settings = {"settings": {"graph": "auto", "precision": "fp32", "memory.history": "first"}}
     write_json(latency, json.loads(latency.read_text()) | settings | {"run": run.id, "artifacts": {}})
@@ -103,4 +105,25 @@ def make_mutants(outputs: Path, count: int, seed: int = 0) -> list[Run]:
     for number in range(count):
         found.append(make_run(outputs, f"mutant {number}"))
         mutate(dice.choice(list_records(found[-1])), dice)
+    return found
+
+
+def make_archives(folder: Path, count: int, seed: int = 0) -> list[Path]:
+    """Make archives of runs, each with a mutated record, or with changed bytes of its own."""
+    dice, found = random.Random(seed), []
+    for number in range(count):
+        run = make_run(folder, f"archived {number}")
+        if number % 2:
+            mutate(dice.choice(list_records(run)), dice)
+        found.append(folder / f"{number}.zip")
+        with zipfile.ZipFile(found[-1], "w", zipfile.ZIP_DEFLATED) as archive:
+            for path in filter(Path.is_file, sorted(run.folder.rglob("*"))):
+                archive.write(path, path.relative_to(run.folder.parent))
+        if number % 2 == 0:
+            content = bytearray(found[-1].read_bytes())
+            for _ in range(dice.randint(1, 4)):
+                content[-dice.randint(1, min(len(content), dice.choice([100, 2000, 10**6])))] = (
+                    dice.randrange(256)
+                )
+            found[-1].write_bytes(content[: dice.choice([None, dice.randrange(len(content))])])
     return found

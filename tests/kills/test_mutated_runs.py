@@ -7,11 +7,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 
 import pytest
-from conftest import Memmlp
+from conftest import Memmlp, one_line
 from fake_logger import FakeLogger
-from mutated_runs import STAGES, make_mutants, make_run
+from mutated_runs import STAGES, make_archives, make_mutants, make_run
 from rich.console import Console
 
 from memmlp.report.tables.build_table import (
@@ -29,15 +30,16 @@ from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import render
 from memmlp.sweep.sweep_file import parse_sweep
 
-MAX_SECONDS = 5.0
+MAX_SECONDS, MAX_KILOBYTES = 5.0, 300_000
 COUNTS = [40, pytest.param(500, marks=pytest.mark.long)]
 
 
 @contextmanager
 def timed(command: str) -> Iterator[None]:
-    started = time.process_time()
+    started, size = time.process_time(), getrusage(RUSAGE_SELF).ru_maxrss
     yield
     assert time.process_time() - started < MAX_SECONDS, command
+    assert getrusage(RUSAGE_SELF).ru_maxrss - size < MAX_KILOBYTES, command
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -88,3 +90,22 @@ def test_damaged_runs_hide_no_other(memmlp: Memmlp, tmp_path: Path, count: int):
         sync_runs(logger, list_runs(tmp_path / "outputs"), warnings.append)
     assert good.id in logger.server.fingerprints
     assert all(sum(run_id in line for line in warnings) == 1 for run_id in bad)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_damaged_archives_are_refused_or_are_sound_runs(memmlp: Memmlp, tmp_path: Path, count: int):
+    outputs, accepted = tmp_path / "outputs", []
+    good = make_run(outputs, "the good run")
+    for path in make_archives(tmp_path / "from anybody", count):
+        with timed(f"runs import {path.name}"):
+            ran = memmlp("runs", "import", str(path))
+        if ran.code:
+            assert one_line(ran, str(path))
+        else:
+            accepted.append(path)
+    runs = list_runs(outputs)
+    assert len(runs) == len(accepted) + 1
+    assert len(accepted) < count * 2 / 3
+    assert good.id in memmlp("runs", "list", "--all").out
+    assert not any(run.damage or run.verify() for run in runs if run.id != good.id)
+    assert {path.name for path in outputs.glob("*/*")} == {run.id for run in runs}
