@@ -189,7 +189,6 @@ def find_running_job() -> str:
 
 def test_a_sweep_of_jobs_that_time_out_ends_as_an_undisturbed_one(cluster: Path, trial: Trial):
     trial.set_pace(1.0)
-    earlier = len(list_ends(cluster))
     controller = trial.start("timed", "executor=slurm", "slurm.time=1")
 
     def count_trainings() -> int:
@@ -199,7 +198,7 @@ def test_a_sweep_of_jobs_that_time_out_ends_as_an_undisturbed_one(cluster: Path,
     until(lambda: count_trainings() > TIMEOUTS, "both runs are interrupted five times", controller)
     trial.set_pace(0.0)
     assert controller.wait() == 0, (trial.folder / "timed.log").read_text()
-    ends = list_ends(cluster)[earlier:]
+    ends = [end for end in list_ends(cluster) if end["TimeLimit"] == "1"]
     timeouts = sorted(end["EndTime"] for end in ends if end["JobState"] == "TIMEOUT")
     starts = sorted(end["StartTime"] for end in ends)[WORKERS:]
     pairs = zip(timeouts, starts, strict=False)
