@@ -20,14 +20,14 @@ from memmlp.motion.importing.convert import JUMP, Conversion, convert_recording,
 from memmlp.motion.importing.skeleton_map import REQUIRED, SkeletonMap, strip_namespace
 
 LEG = {  # joint of a leg -> words that name it, the clearest first
-    "hip": ("thigh", "upleg", "upperleg", "femur", "uplegs", "hip"),
+    "hip": ("thigh", "upleg", "upperleg", "femur", "uplegs", "thighbend", "hip"),
     "knee": ("knee", "shin", "calf", "lowerleg", "lowleg", "loleg", "tibia", "leg"),
     "ankle": ("ankle", "foot"),
     "foot": ("toe", "toes", "toebase", "ball", "foot", "toe0"),
 }
 ARM = {
-    "shoulder": ("upperarm", "uparm", "humerus", "shldr", "arm", "shoulder"),
-    "elbow": ("elbow", "forearm", "lowerarm", "lowarm", "loarm", "radius"),
+    "shoulder": ("upperarm", "uparm", "humerus", "shldr", "uarm", "shldrbend", "arm", "shoulder"),
+    "elbow": ("elbow", "forearm", "lowerarm", "lowarm", "loarm", "radius", "farm", "forearmbend"),
     "wrist": ("wrist", "hand"),
 }
 COLLAR = ("collar", "clavicle", "thorax", "shoulder", "collarbone")
@@ -63,15 +63,13 @@ class MapGuess:
 def split_node_name(name: str) -> NodeName:
     """Split a node's name without namespace, such as `LeftUpLeg`, `UpperArm_L` or `lfemur`, into side and
     word. A side letter as in `lfemur` is split off only if the rest is a known word."""
-    tokens = [token.lower() for token in TOKENS.findall(name.removesuffix(END))]
-    sides = {SIDES[token] for token in tokens if token in SIDES}
-    if len(sides) == 1:
-        return NodeName(sides.pop(), "".join(token for token in tokens if token not in SIDES))
-    word = "".join(tokens)
-    glued = GLUED.fullmatch(word)
+    glued = GLUED.fullmatch(name.removesuffix(END).lower())
     if glued and glued[2] in KNOWN:
         return NodeName(SIDES[glued[1]], glued[2])
-    return NodeName("", word)
+    tokens = [token.lower() for token in TOKENS.findall(name.removesuffix(END))]
+    sides = {SIDES[token] for token in tokens if token in SIDES}
+    word = "".join(token for token in tokens if token not in SIDES or len(sides) != 1)
+    return NodeName(sides.pop() if len(sides) == 1 else "", word)
 
 
 def guess_map(recording: Recording, name: str) -> MapGuess:

@@ -57,11 +57,16 @@ HDM = dict(  # names of joints in ASF files, as in HDM05 and CMU's database
 )  # fmt: skip
 
 
-def test_names_of_another_program_are_known(tmp_path: Path):
-    bvh = renamed(walks(tmp_path, "cmu_motionbuilder"), HDM)
+DAZ = {"LeftUpLeg": "lThighBend", "LeftArm": "lShldrBend", "LeftForeArm": "lForearmBend"}
+
+
+@pytest.mark.parametrize("others", [{}, DAZ, {"LeftArm": "LUArm", "LeftForeArm": "LFArm"}])
+def test_names_of_another_program_are_known(tmp_path: Path, others: dict[str, str]):
+    names = HDM | others
+    bvh = renamed(walks(tmp_path, "cmu_motionbuilder"), names)
     proposed = guess_map(bvh, "mine")
     nodes = load_skeleton("cmu_motionbuilder").joints | WRISTS["cmu_motionbuilder"]
-    expected = {joint: HDM[node] for joint, node in nodes.items()}
+    expected = {joint: names[node] for joint, node in nodes.items()}
     assert proposed.skeleton.joints == expected
 
 
