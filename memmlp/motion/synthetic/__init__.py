@@ -48,12 +48,17 @@ def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 
     lengths = [max(2, int(frames)) for frames in np.diff(ends, prepend=0)]
     repetitions = math.ceil(len(lengths) / len(ACTIVITIES))
     names = np.concatenate([rng.permutation(list(ACTIVITIES)) for _ in range(repetitions)])
-    paths = []
-    for index, frames in enumerate(progress_bar(lengths, "synthesize")):
-        name = str(names[index])
-        path = out / name / f"{name}_{index // len(ACTIVITIES):03d}.npz"
-        write_clip(path, synthesize_clip(name, int(rng.integers(2**62)), seconds=frames / fps, fps=fps))
-        paths.append(path)
+    paths: list[Path] = []
+    try:
+        for index, frames in enumerate(progress_bar(lengths, "synthesize")):
+            name = str(names[index])
+            path = out / name / f"{name}_{index // len(ACTIVITIES):03d}.npz"
+            write_clip(path, synthesize_clip(name, int(rng.integers(2**62)), seconds=frames / fps, fps=fps))
+            paths.append(path)
+    except BaseException:  # a part of the clips must not pass for all of them
+        for path in paths:
+            path.unlink(missing_ok=True)
+        raise
     return paths
 
 

@@ -1,6 +1,8 @@
 """`memmlp data synth`, `show`, `prepare` and `inspect`."""
 
+import errno
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,14 +14,19 @@ import memmlp.cli.data as commands
 from memmlp.common.errors import InputError
 from memmlp.config.build_request import build_motion
 from memmlp.config.compose import compose_config
+from memmlp.motion import synthetic
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.synthetic import synthesize_clip
 
 
 @pytest.mark.slow
-def test_synthetic_clips_are_not_mixed_with_others(memmlp, tmp_path: Path):
+def test_synthetic_clips_are_not_mixed_with_others(memmlp, tmp_path: Path, monkeypatch):
     words = ["data", "synth", "--out", "clips", "--minutes", "0.05"]
+    with monkeypatch.context() as full:
+        disk = Mock(side_effect=[None, OSError(errno.ENOSPC, "No space left on device", "clips/a.npz")])
+        full.setattr(synthetic, "write_clip", lambda path, clip: disk() or write_clip(path, clip))
+        assert one_line(memmlp(*words), "clips/a.npz: No space left on device")
     assert memmlp(*words).code == 0
     before = sorted(path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz"))
     assert one_line(memmlp(*words, "--seed", "1"), "--out clips")
