@@ -86,9 +86,9 @@ def _read_poses(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray
     tracker may have NaN, also as its norm. Raises InputError for another shape."""
     poses, quaternions = np.full((3, 12), np.nan), {}
     for index, (name, tracker) in enumerate(zip(TRACKERS, trackers, strict=True)):
-        if tracker is None:
-            continue
         try:
+            if tracker is None or any(part is None for part in tracker):
+                continue
             position, rotation = (np.asarray(part, np.float64) for part in tracker)
         except (TypeError, ValueError) as error:
             raise InputError(f"{name}: expected (position, rotation) as arrays, or None") from error

@@ -103,9 +103,10 @@ def test_bad_times_are_rejected():
 
 NAN, IDENTITY = math.nan, [0, 0, 0, 1]
 POSES = [
-    (True, None), (True, [[0, 0, 0], [0, 0, 0, 0]]), (True, [[NAN] * 3, [NAN] * 4]),
+    (True, None), (True, [None, IDENTITY]), (True, [[0.7, 1.4, 0], None]), (True, [[NAN] * 3, [NAN] * 4]),
     (True, [[None] * 3, [None] * 4]), (True, [[0.7, None, 0], IDENTITY]),
-    (True, [[0.7, 1.4, 0], [0, 0, 0, 0]]), (True, [[0, 0, 0], IDENTITY]), (True, [[2e6, 0, 0], IDENTITY]),
+    (True, [[0, 0, 0], [0, 0, 0, 0]]), (True, [[0.7, 1.4, 0], [0, 0, 0, 0]]),
+    (True, [[0, 0, 0], IDENTITY]), (True, [[2e6, 0, 0], IDENTITY]),
     (True, [[0.7, 1.4, 0], [0, NAN, 0, 1]]), (True, [[0.7, math.inf, 0], IDENTITY]),
     (True, [[0.7, 1.4, 0], [0, 0, 0, 1e-3]]), (False, [[0.7, 1.4, 0], IDENTITY]),
     (False, [[0, 1e-4, 0], [0, 1, 0, 0]]), (False, [[0, 0, 1.4], [0.5, 0.5, 0.5, -0.5]]),

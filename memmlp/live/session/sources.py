@@ -108,7 +108,7 @@ def read_packet(fields: Mapping[str, Any]) -> Packet:
 
 
 def _read_pose(name: str, values: Any) -> QuaternionPose:
-    if values is None:
+    if not values:  # null, false or empty: lost
         return None
     try:
         pose = np.array(values, np.float64)

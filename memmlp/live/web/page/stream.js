@@ -219,14 +219,14 @@ export class Stream {
 // Whether a tracker is lost: the same rules as memmlp.live.tracker_input.find_lost. It is null, has NaN, is far away, at the
 // exact origin or without a rotation, or it was still for some seconds in which another tracker moved.
 export function isLost(tracker, still = 0) {
-  if (!tracker || still > FROZEN) return true;
+  if (!tracker?.position || !tracker.rotation || still > FROZEN) return true;
   const { position, rotation } = tracker;
   return ![...position, ...rotation].every(x => Number.isFinite(x) && Math.abs(x) <= FARTHEST) || !position.some(Boolean) || Math.hypot(...rotation) < UNIT;
 }
 
 // A tracker with a unit quaternion, or NEUTRAL.
 function read(tracker, name, still) {
-  if (tracker && (tracker.position.length !== 3 || tracker.rotation.length !== 4)) throw new Error(`${name}: must be a position of 3 numbers and a rotation of 4 numbers`);
+  if (tracker?.position && tracker.rotation && (tracker.position.length !== 3 || tracker.rotation.length !== 4)) throw new Error(`${name}: must be a position of 3 numbers and a rotation of 4 numbers`);
   const norm = Math.hypot(...(tracker?.rotation ?? IDENTITY));
   if (Math.abs(norm - 1) > UNIT && norm >= UNIT && norm < Infinity) throw new Error(`${name}: quaternion has norm ${norm.toPrecision(3)}; must be 1`);
   if (isLost(tracker, still)) return NEUTRAL;
