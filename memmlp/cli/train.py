@@ -80,7 +80,7 @@ def _run_with_hydra(args: argparse.Namespace, train_from_config: Callable[[DictC
     try:
         main(train_from_config)()
     except Exception as error:
-        if type(error).__module__.split(".")[0] in ("hydra", "omegaconf"):
+        if args.cfg or type(error).__module__.split(".")[0] in ("hydra", "omegaconf"):
             raise InputError(explain_error(error, args.overrides)) from error
         raise
     finally:

@@ -162,4 +162,7 @@ for _tag, _pattern, _first in (
 
 def parse_config_yaml(text: str) -> Any:
     """Return the content of a YAML text; see `PlainYaml`. Raises YAMLError."""
-    return yaml.load(text, PlainYaml)
+    try:
+        return yaml.load(text, PlainYaml)
+    except RecursionError:
+        raise yaml.YAMLError("nested too deeply") from None

@@ -118,11 +118,18 @@ SOURCES = "data.sources"
 WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
 
 
+def _quote_texts(key: str, value: str) -> str:
+    """Return the override with quotes around its value, or around each item of a list."""
+    if not (value.startswith("[") and value.endswith("]")):
+        return make_override(key, value)
+    return f"{key}=[{','.join(make_override('', item.strip())[1:] for item in value[1:-1].split(','))}]"
+
+
 def explain_error(error: Exception, overrides: Sequence[str]) -> str:
     """Return a line that explains an error while these overrides were composed."""
     if isinstance(error, OverrideParseException):
         key, equals, value = str(error.override).partition("=")
-        quoted = f"; quote a text: {join_command([make_override(key, value)])}" if equals else ""
+        quoted = f"; quote a text: {join_command([_quote_texts(key, value)])}" if equals else ""
         return f"{error.override}: cannot be parsed; expected KEY=VALUE, +KEY=VALUE or ~KEY{quoted}"
     if isinstance(error, MissingConfigException):
         return _explain_missing_option(error)

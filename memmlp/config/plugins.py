@@ -30,6 +30,7 @@ from memmlp.common.components import SLOTS, Component, add_package, collect_comp
 from memmlp.common.errors import InputError
 from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import parse_overrides
+from memmlp.common.schema import parse_config_yaml
 from memmlp.common.settings import MetricSettings
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
 
@@ -37,7 +38,7 @@ GROUP = "memmlp.plugins"
 VARIABLE = "MEMMLP_PLUGINS"
 KEY = "plugins"
 OWN = "command-line"  # Hydra's name for the folder of `--config-dir`
-NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
+NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 
 _active: dict[str, Path] = {}
 _own: ContextVar[Path | None] = ContextVar("config_dir", default=None)
@@ -68,7 +69,7 @@ def find_named_packages(words: Iterable[str]) -> list[str]:
     packages: list[str] = []
     for value in values:
         try:
-            content = yaml.safe_load(value)
+            content = parse_config_yaml(value)
         except yaml.YAMLError:  # reported when the config is composed
             continue
         packages += [str(name) for name in content] if isinstance(content, list) else []

@@ -1,3 +1,6 @@
+import pytest
+import yaml
+
 from memmlp.common.schema import parse_config_yaml
 
 
@@ -7,6 +10,8 @@ def test_values_are_those_of_the_command_line():
     )
     assert content["a"] == ["off", "on", "010", "12:30", "1_000", "2024-01-01", "0x10", "true"]
     assert content["b"] == [0.001, 5, -0.5, True, None, None]
+    with pytest.raises(yaml.YAMLError, match="nested too deeply"):
+        parse_config_yaml("[" * 5000)
 
 
 def test_labels_are_text_as_written():
