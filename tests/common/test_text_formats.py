@@ -13,18 +13,11 @@ from markdown_it import MarkdownIt
 from omegaconf import OmegaConf
 from sqlalchemy import make_url
 
+from benchmarks.nasty_names import PIECES
 from memmlp.common import text_formats as formats
 from memmlp.common.errors import InputError
 from memmlp.config.compose import compose_config
 
-PIECES = [
-    *"abz019é漢\u202e😀\u200d'\"\\ $%{}=,[]()~:;#&|<>*?!@`^-+./_\n\t\x1b",
-    "${",
-    "off",
-    "null",
-    ":bug:",
-    "&amp;",
-]
 texts = st.lists(st.sampled_from(PIECES), max_size=12).map("".join)
 quickly = settings(max_examples=200, deadline=None, derandomize=True, database=None)
 

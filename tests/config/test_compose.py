@@ -115,7 +115,8 @@ BAD = {
     "broken command lines": [
         (["--no-such-flag"], ["--no-such-flag"]), (["-m", "--cfg", "job"], ["--multirun, --cfg", "only one"]),
         (["--config-dir", "nowhere"], ["nowhere", "existing folder"]),
-        (["evaluation.metrics=[é]"], ["evaluation.metrics=['é']"]), (["refiner=null", "--cfg", "job"], ["refiner=null"]),
+        (["evaluation.metrics=[é]"], ["evaluation.metrics=['é']"]),
+        (["refiner=null", "--cfg", "job"], ["refiner=null"]),
     ],
     "a bad second job, before the first starts": [
         (["-m", "model.width=16,-1"], ["model.width=-1", "at least 1"]),

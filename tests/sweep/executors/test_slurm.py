@@ -144,22 +144,19 @@ def test_a_job_lives_while_it_waits_and_while_its_heart_beats(
     assert job.complaint() is None
 
 
-def test_a_job_that_slurm_holds_is_replaced(tmp_path: Path, cluster: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(slurm, "QUEUE_INTERVAL", -1.0)
-    (job,) = submit(tmp_path)
-    (cluster / "queue").write_text("42_0 PENDING Priority\n")
-    assert job.alive()
-    (cluster / "queue").write_text("42_0 PENDING launch failed requeued held\n")
-    assert not job.alive()
-    assert (cluster / "cancelled").read_text() == "42_0\n"
-
-
-def test_a_job_that_left_the_queue_has_ended(tmp_path: Path, cluster: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_job_that_slurm_holds_or_no_longer_lists_is_replaced(
+    tmp_path: Path, cluster: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Without an answer of Slurm it may be waiting."""
     monkeypatch.setattr(slurm, "QUEUE_INTERVAL", -1.0)
     (job,) = submit(tmp_path)
     assert not job.alive()
     assert "42_0" in (job.complaint() or "")
+    (cluster / "queue").write_text("42_0 PENDING Priority\n")
+    assert job.alive()
+    (cluster / "queue").write_text("42_0 PENDING launch failed requeued held\n")
+    assert not job.alive()
+    assert (cluster / "cancelled").read_text() == "42_0\n"
     (cluster / "squeue").write_text("#!/bin/sh\nexit 1\n")
     assert job.alive()
 
