@@ -218,7 +218,7 @@ def test_jobs_that_time_out_without_a_controller_go_on(cluster: Path, trial: Tri
     trial.kill("alone", controller)
     jobs = sorted(list_jobs())
     for job in jobs:
-        slurm("scontrol", "update", f"JobId={job}", "TimeLimit=2")
+        slurm("scontrol", "update", f"JobId={job}", "TimeLimit=3")
     for number in range(1, TIMEOUTS + 1):
         trial.set_pace(5.0)
         until(lambda number=number: all(int(show(job)["Restarts"]) >= number for job in jobs), "a time-out")
