@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, TypedDict
 
 import pytest
-from mutated_runs import BOMB
 
+from benchmarks.mutated_runs import BOMB
 from memmlp.common.schema import check_type, parse_json, parse_yaml
 
 

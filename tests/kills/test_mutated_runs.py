@@ -12,9 +12,9 @@ from resource import RUSAGE_SELF, getrusage
 import pytest
 from conftest import Memmlp, one_line
 from fake_logger import FakeLogger
-from mutated_runs import STAGES, make_archives, make_mutants, make_run
 from rich.console import Console
 
+from benchmarks.mutated_runs import STAGES, make_archives, make_mutants, make_run
 from memmlp.report.tables.build_table import (
     find_finished_runs,
     make_run_finder,

@@ -1,19 +1,30 @@
-"""Folders of runs with one damaged or hostile record each."""
+"""Make damaged and hostile runs and archives beside a good run, and measure commands on all of them.
+
+    python benchmarks/mutated_runs.py --runs 500
+
+tests/kills checks what the commands print.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
+import os
 import random
+import subprocess
+import sys
+import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import click
 import yaml
-from fake_runs import fake_run
 
-from memmlp.common.files import file_digest, write_json
+from memmlp.common.files import file_digest
+from memmlp.runs.records import compute_digest
 from memmlp.runs.run import Run
 
 CONFIG = {
@@ -26,7 +37,6 @@ CONFIG = {
     "export": {"graph": "auto", "precision": "fp32", "opset": 18}, "loggers": {},
 }  # fmt: skip
 STAGES, FINISHED = ("window-0", "stream-0", "fp32-0"), "2026-01-02T04:00:00+00:00"
-SETTINGS = {"settings": {"mode": "stream", "ik": "off", "memory.history": "first"}}
 VALUES = (
     None, True, -1, 0, 5, 1e308, 2**70, 10**400, "", "x", "nan", "\ud800", "../../../etc/passwd", "a\nb",
     "2026-13-45", [], {}, [None], [[]], {"": None}, {"a": {"a": {"a": {}}}},
@@ -44,28 +54,67 @@ CONTENTS = (
 )  # fmt: skip
 
 
+@click.command()
+@click.option("--runs", default=500, show_default=True, help="Number of damaged runs, and of archives.")
+def main(runs: int) -> None:
+    """Print each command's CPU seconds and memory."""
+    with tempfile.TemporaryDirectory() as folder:
+        outputs, archives = Path(folder) / "outputs", Path(folder) / "archives"
+        make_run(outputs, "the good run")
+        make_mutants(outputs, runs)
+        for words in (["runs", "list", "--all"], ["loggers", "sync", "--logger", "tensorboard"]):
+            measure([*words, "--outputs", str(outputs)])
+        for path in make_archives(archives, runs)[:10]:
+            measure(["runs", "import", str(path), "--outputs", str(outputs)])
+
+
+def measure(words: Sequence[str]) -> None:
+    """Run a command line, and print what it used."""
+    line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", *words]
+    process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    seconds = used.ru_utime + used.ru_stime
+    code = os.waitstatus_to_exitcode(status)
+    click.echo(f"{' '.join(words[:2])}: exit {code}, {seconds:.1f} CPU-s, {used.ru_maxrss / 1000:.0f} MB")
+
+
 def make_run(outputs: Path, name: str) -> Run:
-    run = fake_run(
-        outputs,
-        name,
-        clips=("salsa/01",),
-        branches=("rotation",),
-        config=CONFIG,
-        evaluated=SETTINGS,
-        log=True,
-    )
+    """Make a finished and evaluated run by its files."""
+    run = Run.from_id(outputs, hashlib.sha256(name.encode()).hexdigest()[:16])
     attempt = {"started": "2026-01-02T03:04:05+00:00", "step": 0, "stage": "training", "pid": 1}
     part = {"id": "b" * 16, "kind": "vqvae", "component_versions": {"vqvae": 1}, "sources": {"a.py": "0"}}
-    facts = {"name": name, "stages": list(STAGES), "steps": 600, "attempts": [attempt], "finished": FINISHED}
-    sources = {f"{number}.py": "0" for number in range(200)}
-    run.write_manifest(facts | {"prerequisite_runs": [part], "sources": sources})
+    manifest = {
+        "id": run.id, "kind": "memmlp", "name": name, "started": attempt["started"], "finished": FINISHED,
+        "seconds": {"train": 300.0}, "stages": list(STAGES), "steps": 600, "attempts": [attempt],
+        "prerequisite_runs": [part], "sources": {f"{number}.py": "0" for number in range(200)},
+        "data": "d" * 64, "git": {"commit": "0123456789abcdef", "dirty": False}, "cpu": "A processor",
+        "packages": {"torch": "2.0.0"}, "component_versions": {"memory": 1}, "body": "builtin",
+    }  # fmt: skip
+    settings = {"graph": "auto", "precision": "fp32", "memory.history": "first"}
+    place = run.deployment("fp32-0")
+    latency = {"median_ms": 0.8, "p95_ms": 1.1, "ratio_to_yardstick": 0.6, "parameters": 356_798}
+    records = {
+        run.manifest_path: manifest,
+        run.config_path: {"seed": 0, **CONFIG},
+        place.latency: latency | {"settings": settings, "run": run.id, "artifacts": {}, "made": "2026"},
+        run.folder / "notes.json": {"tags": ["good"], "note": "n"},
+    }
+    errors = {"MPJPE": 6.5, "MPJRE": 4.15, "Jitter": 11.0}
+    for mode in ("window", "stream"):
+        report = {
+            "run": run.id, "name": f"{mode}-0", "mode": mode, "mean": {"rotation": errors}, "made_by": {},
+            "settings": {"mode": mode, "ik": "off", "memory.history": "first"}, "made": "2026",
+            "clips": [{"name": "salsa/01", "frames": 600, "rotation": errors}],
+        }  # fmt: skip
+        records[run.evaluation(f"{mode}-0")] = report | {"digest": compute_digest(report)}
+    for path, content in records.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(content))
+    line = {"step": 600, "phase": "val", "time": 1.0, "values": {"rotation MPJPE": 6.5}}
+    run.metrics_path.write_text(json.dumps(line) + "\n")
     run.model.write_bytes(b"weights")
     artifacts = {run.model.name: file_digest(run.model)}
-    write_json(run.marker, {"id": run.id, "finished": FINISHED, "artifacts": artifacts})
-    latency = run.deployment("fp32-0").latency
-    settings = {"settings": {"graph": "auto", "precision": "fp32", "memory.history": "first"}}
-    write_json(latency, json.loads(latency.read_text()) | settings | {"run": run.id, "artifacts": {}})
-    write_json(run.folder / "notes.json", {"tags": ["good"], "note": "n"})
+    run.marker.write_text(json.dumps({"id": run.id, "finished": FINISHED, "artifacts": artifacts}))
     return run
 
 
@@ -127,3 +176,7 @@ def make_archives(folder: Path, count: int, seed: int = 0) -> list[Path]:
                 )
             found[-1].write_bytes(content[: dice.choice([None, dice.randrange(len(content))])])
     return found
+
+
+if __name__ == "__main__":
+    main()
