@@ -61,7 +61,7 @@ class LeaseLost(RuntimeError):
     process writes nothing more to the folder. The message is one line; the exit code is 1."""
 
 
-def is_disk_error(error: Exception) -> bool:
+def is_disk_error(error: BaseException) -> bool:
     """Return whether the disk is full or read-only; then the run itself did not fail."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 

@@ -11,7 +11,7 @@ import pytest
 from command_line import BRIEF, SMALL, in_folder, run, run_apart
 from processes import Forked, forked, until
 
-from benchmarks import chaos
+from benchmarks import chaos, nasty_names
 from memmlp.cli.tune import SearchSetup, prepare_search
 from memmlp.common.lease import current_process
 from memmlp.networks import checkpoint
@@ -80,6 +80,12 @@ def test_a_sweep_under_kills_ends_as_an_undisturbed_one(
 def test_a_search_under_kills_has_every_trial_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fork_controllers(tmp_path, monkeypatch, "--workers", "1")
     assert chaos.search_storm(2, 1, 1, random.Random(0), SMALL) == []
+
+
+@pytest.mark.long
+def test_nasty_names_pass_through_all_commands():
+    pytest.importorskip("mlflow")
+    assert nasty_names.find_problems(3, random.Random(0)) == []
 
 
 def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:
