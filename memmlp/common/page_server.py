@@ -77,8 +77,8 @@ class AccessRules:
         """Return whether a request may be answered, judging by its host, origin and token."""
         url = urllib.parse.urlsplit(path)
         if self.token is None:
-            host = headers.get("Host", "")
-            if (host.rpartition(":")[0] or host) not in (HOST, "localhost", self.host):
+            hosts = [re.sub(":[0-9]+$", "", host) for host in headers.get_all("Host", [])]
+            if hosts not in ([HOST], ["localhost"], [self.host]):
                 return False
         else:
             given = dict(urllib.parse.parse_qsl(url.query)).get("token", "") or _read_cookie(headers, port)

@@ -47,6 +47,7 @@ def test_which_addresses_are_this_machine_s_alone(host: str, alone: bool):
 @pytest.mark.parametrize(("given", "allowed"), [
     ({"Host": "127.0.0.1:8765"}, True), ({"Host": "localhost"}, True), ({}, False),
     ({"Host": "127.0.0.1.evil.example:80"}, False), ({"Host": "evil.example:8765"}, False),
+    ({"Host": "localhost:80@evil.example"}, False),
     ({"Host": "localhost", "Sec_Fetch_Site": "cross-site"}, False),
     ({"Host": "localhost", "Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}, True),
     ({"Host": "evil.example", "Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}, False),
