@@ -93,7 +93,7 @@ def find_problems(count: int, dice: random.Random) -> list[str]:
     """Run a round for each name, and list what was lost or altered."""
     printable = [piece for piece in PIECES if piece.isprintable()]
     in_line = [piece for piece in PIECES if escape_line_breaks(piece) == piece]
-    texts = [make_names(count, pieces, dice, FORBIDDEN) for pieces in (printable, in_line, PIECES, PIECES)]
+    texts = [make_names(count, pieces, dice, FORBIDDEN) for pieces in (printable, in_line, in_line, PIECES)]
     tags = make_names(count, TAG_PIECES, dice, r"^.{65,}|^-")
     modules = make_names(count, MODULE_PIECES, dice, r"^(?![^\W\d]\w*$)")
     problems = []
