@@ -32,7 +32,7 @@ test-all: $(STAMP)
 test-fast: $(STAMP)
 	$(PYTEST) -m "not slow and not long"
 
-# A real Slurm of one node in a temporary folder, where Debian's slurm-wlm and munge are installed; ten minutes.
+# A real Slurm of one node in a temporary folder, where Debian's slurm-wlm and munge are installed; 25 minutes.
 test-slurm: $(STAMP)
 	MEMMLP_SLURM=1 $(BIN)/python -m pytest -rs -s tests/sweep/executors/test_real_slurm.py
 

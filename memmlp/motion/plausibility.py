@@ -33,7 +33,8 @@ BACKWARD_FEET = 0.5  # cosine of feet and pelvis; recorded motion reaches -0.2
 SAMPLES = 50  # maximum number of frames for posture checks
 JUMP = 8.0  # ratio to surrounding steps; recorded motion reaches 5, cuts or jumps by 1 m exceed 13
 AROUND, SLOWEST = 9, 0.3  # window, frames; m/s added to the median step, because resting bodies tremble
-FROZEN, TURNING = 0.5, 0.1  # seconds with constant trans; rad/s of a leg that moves meanwhile
+FROZEN = 0.5  # seconds with constant trans or poses
+TURNING, MOVING = 0.1, 0.1  # rad/s of a leg, and m/s of trans, that move meanwhile
 
 
 def check_plausible(path: Path, clip: Clip) -> str:
@@ -99,7 +100,7 @@ def find_faults(clip: Clip) -> Iterator[str]:
 
 
 def _find_jumps(clip: Clip) -> Iterator[str]:
-    """Yield descriptions of the largest jump between two frames and of the longest constant trans."""
+    """Yield descriptions of the largest jump between two frames and of the longest constant trans or pose."""
     if len(clip) < AROUND:
         return
     pieces = [
@@ -112,12 +113,16 @@ def _find_jumps(clip: Clip) -> Iterator[str]:
         frame = int(ratio.argmax())
         far = f"the joints move by {steps[frame]:.2f} m on average after frame {frame}"
         yield f"{far}, much farther than in the frames around it: a jump or a cut"
-    still = (np.diff(clip.trans, axis=0) == 0).all(-1)
-    turns = np.abs(np.diff(clip.poses[:, LEGS], axis=0)).max((1, 2)) * clip.fps
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], still & (turns > TURNING), [False]]).astype(int)))
-    longest = int(np.diff(ends)[::2].max(initial=0))
-    if longest > FROZEN * clip.fps:
-        yield f"trans is constant for {longest} successive frames while the legs turn, so it may be lost"
+    moves = np.diff(clip.trans, axis=0)
+    speeds = np.linalg.norm(moves, axis=-1) * clip.fps
+    turns = np.abs(np.diff(clip.poses, axis=0)) * clip.fps
+    for what, moving, is_lost in (
+        ("trans", "the legs turn", (moves == 0).all(-1) & (turns[:, LEGS].max((1, 2)) > TURNING)),
+        ("the pose", "trans moves", (turns == 0).all((1, 2)) & (speeds > MOVING)),
+    ):
+        longest = int(np.diff(_find_runs(is_lost)).max(initial=0))
+        if longest > FROZEN * clip.fps:
+            yield f"{what} is constant for {longest} successive frames while {moving}, so it may be lost"
 
 
 def _is_y_up(clip: Clip) -> bool:

@@ -31,7 +31,7 @@ from memmlp.sweep.executors.slurm import MIN_WARNED_MINUTES
 ASKED = os.environ.get("MEMMLP_SLURM") == "1"
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(not ASKED, reason="takes ten minutes; run it with `make test-slurm`"),
+    pytest.mark.skipif(not ASKED, reason="takes 25 minutes; run it with `make test-slurm`"),
     pytest.mark.skipif(bool(find_missing_commands()), reason=f"no {' '.join(find_missing_commands())}"),
 ]
 WORDS = [*BRIEF, "plugins=[pace]", "term=pace", "optim.steps=300", "optim.checkpoint_every=5"]
