@@ -277,9 +277,10 @@ def format_batch_script(folder: Path, options: SlurmOptions, workers: int) -> st
         parameters["signal"] = f"B:USR2@{WARNING}"
     lines = ["#!/bin/bash"]
     for key, value in parameters.items():
-        lines.append(
-            f"#SBATCH --{key.replace('_', '-')}{'' if value is True else f'={shlex.quote(str(value))}'}"
-        )
+        text = (
+            "" if value is True else "=" + shlex.quote(str(value)).replace("\\", "\\\\")
+        )  # as sbatch reads it
+        lines.append(f"#SBATCH --{key.replace('_', '-')}{text}")
     lines += [options.setup] if options.setup else []
     if options.python is None:  # another Python has its own packages
         lines += [f"export {name}={shlex.quote(value)}" for name, value in build_import_variables().items()]

@@ -23,11 +23,18 @@ def lines(tmp_path: Path, **words: str) -> list[str]:
 
 def test_options_reach_sbatch(tmp_path: Path):
     words = {"time": "600", "mem_gb": "16", "cpus": "4", "gpus": "1", "partition": "gpu", "account": "lab"}
-    words |= {"setup": "module load cuda", "mail-user": "me@lab.org", "exclusive": "true", "gres": "disk:1"}
+    words |= {
+        "comment": "it's a\\b",
+        "setup": "module load cuda",
+        "mail-user": "me@lab.org",
+        "exclusive": "true",
+        "gres": "disk:1",
+    }
     found = lines(tmp_path, **words, overcommit="false")
     for line in (
         "time=600", "mem=16GB", "cpus-per-task=4", "gpus-per-node=1", "partition=gpu", "account=lab",
         "mail-user=me@lab.org", "exclusive", "gres=disk:1", "job-name=memmlp", "signal=B:USR2@90", "requeue",
+        """comment='it'"'"'s a\\\\b'""",
     ):  # fmt: skip
         assert f"#SBATCH --{line}" in found
     assert "module load cuda" in found
