@@ -277,9 +277,8 @@ def format_batch_script(folder: Path, options: SlurmOptions, workers: int) -> st
         parameters["signal"] = f"B:USR2@{WARNING}"
     lines = ["#!/bin/bash"]
     for key, value in parameters.items():
-        text = (
-            "" if value is True else "=" + shlex.quote(str(value)).replace("\\", "\\\\")
-        )  # as sbatch reads it
+        quoted = shlex.quote(str(value)).replace("\\", "\\\\")  # sbatch removes single backslashes
+        text = "" if value is True else f"={quoted}"
         lines.append(f"#SBATCH --{key.replace('_', '-')}{text}")
     lines += [options.setup] if options.setup else []
     if options.python is None:  # another Python has its own packages

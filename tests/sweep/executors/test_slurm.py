@@ -23,13 +23,8 @@ def lines(tmp_path: Path, **words: str) -> list[str]:
 
 def test_options_reach_sbatch(tmp_path: Path):
     words = {"time": "600", "mem_gb": "16", "cpus": "4", "gpus": "1", "partition": "gpu", "account": "lab"}
-    words |= {
-        "comment": "it's a\\b",
-        "setup": "module load cuda",
-        "mail-user": "me@lab.org",
-        "exclusive": "true",
-        "gres": "disk:1",
-    }
+    words |= {"setup": "module load cuda", "mail-user": "me@lab.org", "exclusive": "true", "gres": "disk:1"}
+    words["comment"] = "it's a\\b"
     found = lines(tmp_path, **words, overcommit="false")
     for line in (
         "time=600", "mem=16GB", "cpus-per-task=4", "gpus-per-node=1", "partition=gpu", "account=lab",
