@@ -252,6 +252,8 @@ def test_views_pins_scatter_axes_tags_notes_archive_and_commands(browser: Browse
         browser.value(PRESS.format(".picked", "Archive"))
         browser.wait(f"{texts('.picked button')}.includes('Restore')")
         go(browser, running.url, "runs", f"{count('.runs tbody tr')} == 5")
+        browser.click(".count a")
+        browser.wait(f"{count('.runs tbody tr')} == 1")
 
 
 def test_daily_work_groups_baseline_csv_and_changes(browser: Browser, tmp_path: Path):

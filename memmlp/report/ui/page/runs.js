@@ -92,8 +92,9 @@ export async function page(name, route) {
     if (!inUse(tools)) replace(tools, toolbar(query, pinned, settings.group));
     scatterOf(query);
     axesOf(query);
+    const hidden = archived ? 0 : [...runs.values()].filter(run => run.archived).length;
     const count = name => ui.list.filter(run => run.status === name).length;
-    replace(counted, [`${number(ui.list.length)} of ${number(runs.size)} runs`, ...STATES.filter(count).map(name => `${number(count(name))} ${STATE_WORDS[name] ?? name}`)].join(', '));
+    replace(counted, [`${number(ui.list.length)} of ${number(runs.size)} runs`, ...STATES.filter(count).map(name => `${number(count(name))} ${STATE_WORDS[name] ?? name}`)].join(', '), hidden ? [', ', link(address('runs', '', { filter: 'archived=true' }), `${hidden} archived`)] : null);
     replace(dataSets, ui.data.length > 1 ? `On ${ui.data.length} data sets, whose errors are not comparable; filter by one: ${ui.data.slice(0, 5).map(data => `data=${data}`).join(', ')}` : null);
     replace(happening, now());
     const marks = [...new Set(ui.list.slice(0, ui.drawn).flatMap(run => Object.values(run.marks)).map(text => text.replace(/ \(.*?\)|: a core.*/, '')))];
