@@ -97,8 +97,10 @@ class RunIndex:
         record = _digest(sorted(set(stats) - set(log)))
         signature = f"{record}-{_digest(log)}"
         if before is None or before["signature"] != signature:
-            if before and before["record"] == record and not run.damage:
-                facts = {**before, "recent": _list_recent_entries(run)}
+            is_longer = before and before["record"] == record and not before["damage"]
+            recent = _list_recent_entries(run) if is_longer else []
+            if before and recent:  # otherwise the log may be damaged
+                facts = {**before, "recent": recent}
             else:
                 facts, self.reads = read_facts(folder), self.reads + 1
             before = facts | {"signature": signature, "record": record, "statuses": {}}

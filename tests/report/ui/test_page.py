@@ -241,7 +241,9 @@ def test_views_pins_scatter_axes_tags_notes_archive_and_commands(browser: Browse
         for axis, unit in (("time", "hours"), ("samples", "samples")):
             browser.value(choose % (axis, "Over"))
             browser.wait(f"document.querySelector('.curves [role=img]').ariaLabel.includes('by {unit}.')")
-        for button, value, shown in (("Tags", "good", ".tag"), ("Note", "look", ".remark")):
+        for button, value, shown in (
+            ("Tags", "good", ".tag"), ("Note", "look", ".remark"), ("Name", "Mine <b>", "h1"),
+        ):  # fmt: skip
             browser.value(PRESS.format(".picked", button))
             browser.value(fill.format(value))
             browser.click("dialog .primary")
@@ -282,10 +284,6 @@ def test_daily_work_groups_baseline_csv_and_changes(browser: Browser, tmp_path: 
             browser.value(PRESS.format(".picked", button))
             browser.wait(f"{state} == {word!r}")
             assert new.is_stop_requested == (button == "Stop")
-        browser.value(PRESS.format(".picked", "Name"))
-        browser.value("document.querySelector('dialog input').value = 'Mine <b>'")
-        browser.click("dialog .primary")
-        browser.wait(f"{text('h1')} == 'Mine <b>'")
         browser.value(PRESS.format(".picked", "Delete"))
         browser.wait("document.querySelector('dialog')?.textContent.includes('Nothing depends')")
         browser.click("dialog .primary")
