@@ -97,7 +97,7 @@ class Rows:
 
     def list_since(self, state: str, places: Places) -> dict[str, Any]:
         """Return the rows that changed since a state; all rows for another state, then with `all`."""
-        first, _, number = state.partition("-")
+        first, number, *_ = f"{state}--".split("-")  # behind them: a digest of sweeps and searches
         since = int(number) if first == self.first and number.isdigit() else -1
         everything = since < self.changed
         rows = [
