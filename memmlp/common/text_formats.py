@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 PLAIN_OVERRIDE = re.compile(r"(?!(?:true|false|null|inf|nan)$)[A-Za-z_/][A-Za-z0-9_/.+@-]*", re.IGNORECASE)
-HOME = re.compile(r"(?<=[=\[,])~(?=/|$|[\],])[^,\[\]'\"]*")
+HOME = re.compile(
+    r"""(['"])(?:\\.|(?!\1).)*\1|(?<=[=\[,])~(?=/|$|[\],])[^,\[\]'"]*""", re.DOTALL
+)  # a quoted text, or a path below ~
 UNUSUAL_NUMBER = re.compile(
     r"(?<==)[+-]?(?:0\d[\d_]*|\d+_[\d_]*\d)$"
 )  # a key of a number accepts it as text, too
@@ -71,7 +73,7 @@ def keep_text(override: str) -> str:
     value or of a list's item, and with quotes around a number whose digits are not plain, such as 010."""
     if number := UNUSUAL_NUMBER.search(override):
         return f"{override[: number.start()]}'{number[0]}'"
-    return HOME.sub(lambda match: make_override("", os.path.expanduser(match[0]))[1:], override)
+    return HOME.sub(lambda m: m[0] if m[1] else make_override("", os.path.expanduser(m[0]))[1:], override)
 
 
 def make_sqlite_url(path: Path) -> str:

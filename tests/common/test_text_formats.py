@@ -83,7 +83,8 @@ def test_home_in_overrides(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HOME", "/home/jörg")
     assert formats.keep_text("data.root=~/amass") == "data.root='/home/jörg/amass'"
     assert formats.keep_text("data.root=[~/a,/b]") == "data.root=['/home/jörg/a',/b]"
-    assert [formats.keep_text(text) for text in ("~key", "a=b~c")] == ["~key", "a=b~c"]
+    plain = ["~key", "a=b~c", "a='b,~,c'", "a=['[~/b',c]"]
+    assert [*map(formats.keep_text, plain)] == plain
 
 
 @pytest.mark.parametrize("text", ["010", "1_000", "+05"])
