@@ -178,11 +178,24 @@ def _print_table(records: Sequence[Record], keys: Sequence[str], keys_requested:
     removable = ["age"] if keys_requested else [*REMOVABLE_COLUMNS, *reversed(keys[:MAX_COLUMNS])]
     wide = make_console(width=10_000)
     limit = make_console().width
-    while (width := wide.measure(_make_table(columns, keys_requested)).minimum) > limit and removable:
-        columns.pop(removable.pop(0), None)
+    widest = {head: _find_widest(cells) for head, cells in columns.items()}  # all cells would take seconds
+    while (width := wide.measure(_make_table(widest, keys_requested)).minimum) > limit and removable:
+        head = removable.pop(0)
+        columns.pop(head, None)
+        widest.pop(head, None)
     shown = make_console(width=max(limit, width))
     shown.print(_make_table(columns, keys_requested))
     return [key for key in keys if key not in columns]
+
+
+def _find_widest(cells: Sequence[str]) -> list[str]:
+    """Return the cells with the widest line and the widest word."""
+    from rich.cells import cell_len
+
+    return [
+        max(cells, key=lambda cell: max(map(cell_len, split(cell)), default=0), default="")
+        for split in (str.splitlines, str.split)
+    ]
 
 
 def _make_columns(
