@@ -65,7 +65,7 @@ def count_bootstrap_claims(
     rng: np.random.Generator, seeds: int, groups: int, tables: int, shape: str, shares: Sequence[float]
 ) -> Iterator[float]:
     """Yield the family-wise error of the bootstrap p-value for each number of COMPARISONS, from the error of
-    one comparison. Comparisons with a far larger p are not resampled, since they have no small bootstrap p."""
+    one comparison. Comparisons with a far larger p are skipped, since they have no small bootstrap p."""
     for size in COMPARISONS:
         claims, number = 0, tables * (10 if size < 100 else 50)
         for _ in range(0, number, CHUNK):
