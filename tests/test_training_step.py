@@ -1,14 +1,11 @@
 """The products of a training step are those that torch counts, and its time includes them."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from tiny_tasks import OPTIM, motion_task, recurrent_task
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.training_step import ProductRecorder, measure_step_cost, train
-from memmlp.common.errors import InputError
+from benchmarks.training_step import ProductRecorder, measure_step_cost
 from memmlp.training.loop import train_step
 
 
@@ -31,15 +28,3 @@ def test_a_step_takes_longer_than_its_products():
     assert cost.ratios.min() > 1
     assert cost.kernels[0][1] >= cost.kernels[1][1] > 0
     assert torch.get_num_threads() == threads
-
-
-@pytest.mark.slow
-def test_a_training_step_is_timed_beside_its_products(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="refiner"):
-        train.main(["profile=tiny", "refiner=sage"], standalone_mode=False)
-    train.main(["profile=tiny", "--rounds", "1", "--steps", "2"], standalone_mode=False)
-    _, step, products, ratio = (line.split() for line in capsys.readouterr().out.splitlines()[-4:])
-    assert float(ratio[0]) == pytest.approx(float(step[0]) / float(products[0]), rel=0.1)
