@@ -12,6 +12,7 @@ from resource import RUSAGE_SELF, getrusage
 import pytest
 from conftest import Memmlp, one_line
 from fake_logger import FakeLogger
+from processes import until
 from rich.console import Console
 
 from benchmarks.mutated_runs import STAGES, make_archives, make_mutants, make_run
@@ -57,6 +58,7 @@ def test_damaged_runs_hide_no_other(memmlp: Memmlp, tmp_path: Path, count: int):
 
     with timed("ui"):
         answers = Answers(tmp_path / "outputs", lambda *words: {})
+        until(lambda: len(answers.answer("runs", {})["rows"]) == len(runs), "the page has read all runs")
         rows = {row["id"]: row for row in answers.answer("runs", {})["rows"]}
     assert {run_id for run_id, row in rows.items() if row["damage"]} == bad
     for run in runs:
