@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +64,14 @@ class ShownInTensorBoard:
     """A run with an open event file."""
 
     def __init__(self, folder: Path):
-        from tensorboardX import SummaryWriter
+        hides_torch = "torch" not in sys.modules
+        if hides_torch:  # tensorboardX would import it for graphs, which takes 2 s and 200 MB
+            sys.modules["torch"] = None  # type: ignore[assignment]
+        try:
+            from tensorboardX import SummaryWriter
+        finally:
+            if hides_torch:
+                del sys.modules["torch"]
 
         # flush() alone is not enough, since the writer's thread has a queue; the default is 120 s
         self.folder, self.writer = folder, SummaryWriter(str(folder), flush_secs=1)
