@@ -10,6 +10,7 @@ import threading
 import time
 import uuid
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 from memmlp.common.errors import InputError
@@ -38,6 +39,8 @@ def list_visible_gpus() -> GpuGroup:
     """
     text = os.environ.get(VISIBLE)
     if text is None:
+        if version("torch").endswith("+cpu"):  # torch's import takes 1 s
+            return ()
         import torch
 
         return tuple(map(str, range(torch.cuda.device_count())))

@@ -13,6 +13,7 @@ import pytest
 import torch
 from processes import ignoring_interrupts, until
 
+from memmlp.sweep.executors import local
 from memmlp.sweep.executors.local import DebugExecutor, LocalExecutor, list_visible_gpus
 
 
@@ -89,6 +90,7 @@ def test_visible_gpus_are_those_of_the_variable_or_all(monkeypatch, text: str | 
     if isinstance(text, int):
         monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
         monkeypatch.setattr(torch.cuda, "device_count", lambda: text)
+    monkeypatch.setattr(local, "version", lambda _: "2.13.0+cu130")
     assert list_visible_gpus() == found
 
 
