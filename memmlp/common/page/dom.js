@@ -50,7 +50,8 @@ export async function savePng(name, element) {
   const style = `color-scheme: ${matchMedia('(prefers-color-scheme: dark)').matches ? 'dark' : 'light'}`;
   const rules = [...document.styleSheets].flatMap(sheet => [...sheet.cssRules]).map(rule => rule.cssText).join('\n');
   const copy = h('div', { style: `${style}; padding: 8px; height: 100%; background: var(--card); color: var(--ink); font: 14px/1.5 system-ui, sans-serif` }, h('style', {}, rules), element.cloneNode(true));
-  const drawn = `<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}" style="${style}"><foreignObject width="100%" height="100%">${new XMLSerializer().serializeToString(copy)}</foreignObject></svg>`;
+  const space = new DOMParser().parseFromString('<svg>', 'text/html').body.firstChild.namespaceURI;
+  const drawn = `<svg xmlns="${space}" width="${width}" height="${height}" style="${style}"><foreignObject width="100%" height="100%">${new XMLSerializer().serializeToString(copy)}</foreignObject></svg>`;
   const image = Object.assign(new Image(), { src: `data:image/svg+xml,${encodeURIComponent(drawn)}` });
   await image.decode();
   const scale = Math.min(2, 16000 / Math.max(width, height));
