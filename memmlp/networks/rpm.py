@@ -127,8 +127,8 @@ class RPM(WindowlessModel):
         places = torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)[:, : settings.width]
         self.register_buffer("places", places, persistent=False)
         # How far each of the predicted frames (W, 1) may change at a step, from almost 0 to 1.
-        distance = torch.arange(1, settings.horizon + 1) / settings.horizon
-        freedom = (1 - (distance * math.pi / 2).cos())[:, None]
+        distance = torch.arange(1, settings.horizon + 1, dtype=torch.float64) / settings.horizon
+        freedom = (1 - (distance * math.pi / 2).cos())[:, None].float()
         self.register_buffer("freedom", freedom, persistent=False)
 
     def initial_state(self, batch: int = 1) -> State:
