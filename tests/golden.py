@@ -93,10 +93,10 @@ def coordinates(kind: type[World]) -> Numbers:
     return summary("encoded", encoded) | summary("decoded", normalizer.decode_motion(motion, origin))
 
 
-def network(model: MotionModel) -> Numbers:
+def network(model: MotionModel, seed: int = 7) -> Numbers:
     """A training call with its gradients, then two windows and three frames as live."""
     clip = torch.stack([tiny.clip(80, seed) for seed in range(2)])
-    torch.manual_seed(7)
+    torch.manual_seed(seed)
     model.train()
     past, new = clip[:, : model.past_frames], clip[:, model.past_frames : model.past_frames + model.frames]
     motion, _, terms = model.compute_training_outputs(new[..., :SPARSE_DIM], model.true_state(past), new)
@@ -268,6 +268,8 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
         for name in tiny.BASELINES
     },
+    # the seed draws diffusion times 0 and 5: removing the noise of later times magnifies rounding
+    "model.bodiffusion": lambda: network(tiny.baseline("bodiffusion"), seed=51),
     "model.constant_pose": lambda: network(
         ConstantPose(tiny.normalizer(Heading()), ConstantPoseSettings(frames=7))
     ),
