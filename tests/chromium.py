@@ -173,6 +173,7 @@ class Browser:
         self.value(f"window.pressed = null; {'; '.join(listen)}")
         box = f"document.querySelector({selector!r}).getBoundingClientRect()"
         x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)  # which chooses a chart's point
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
         self.wait("window.pressed !== null")

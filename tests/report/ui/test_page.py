@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
+import optuna
 import pytest
 from chromium import Browser
 from fake_search import open_study, to_the_end
@@ -170,7 +171,8 @@ def test_a_sweep_s_effects_curves_and_rounds(browser: Browser, tmp_path: Path):
 
 def test_news_are_shown_without_a_touch(browser: Browser, server: RunsServer, home: Path):
     run = Run.from_id(home, TRAINING)
-    go(browser, server.url, f"run/{run.id}?y=train+loss|system+CPU+[cores]", f"{count('.plot svg')} == 2")
+    curves = "train+loss|system+CPU+[cores]|system+memory+[GB]"
+    go(browser, server.url, f"run/{run.id}?y={curves}", f"{count('.plot svg')} == 3")
     browser.wait(f"{LABEL}?.includes('ends at 4.5')")
     browser.wait(f"{text('#status')} == 'live'")
     words = browser.value("document.querySelector('main').textContent")
@@ -303,6 +305,33 @@ def test_a_search_has_history_slices_contour_axes_and_timeline(browser: Browser,
     browser.wait(f"{count('.trail a')} == 2")
     browser.value("document.querySelectorAll('.trail a')[1].click()")
     browser.wait(f"location.hash.startsWith('#/search/mine?trial=') && {count('tr.chosen')} == 1")
+
+
+def test_importance_from_25_trials_and_a_pareto_front_open_a_run(browser: Browser, tmp_path: Path):
+    (folder := tmp_path / "tune" / "mine").mkdir(parents=True)
+    study, run = open_study(folder, objectives=["MPJPE", "Jitter"]), started_run(tmp_path)
+    write_json(folder / "search.json", asdict(study.search))
+    spaces = {key: optuna.distributions.FloatDistribution(0, 1) for key in ("loss.hand", "lr")}
+
+    def add_trial(number: int) -> None:
+        values = [number, 26 - number if number % 2 else 25]  # the odd ones are on the front, 13 in its middle
+        params = {"loss.hand": number / 25, "lr": number * 7 % 25 / 25}
+        about = {"distributions": spaces, "user_attrs": {"runs": [run.id] if number == 13 else []}}
+        study.study.add_trial(optuna.trial.create_trial(params=params, values=values, **about))
+
+    for number in range(1, 25):  # 0 is waiting
+        add_trial(number)
+    shares = "[...document.querySelectorAll('h2')].find(h => h.textContent == 'Importance').parentElement"
+    with RunsServer(Answers(tmp_path, predict, 0.05), 0) as running:
+        go(browser, running.url, "search/mine", f"{count('.plot svg')} >= 6")
+        assert "needs 25 complete trials; with 24" in browser.value(f"{shares}.textContent")
+        add_trial(25)
+        browser.wait(f"{shares}.querySelector('tr')?.textContent.startsWith('hand')")
+        assert browser.value(LABEL).startswith("Jitter by MPJPE; the best are 25, 23, 21, ")
+        browser.click(".plot svg")
+        browser.wait(f"location.hash == '#/run/{run.id}' && {count('.trail a')} == 2")
+        browser.value("document.querySelectorAll('.trail a')[1].click()")
+        browser.wait(f"{texts('tr.chosen th')} == 'trial 13'")
 
 
 def test_what_runs_and_what_failed_is_on_top(browser: Browser, server: RunsServer, home: Path):
