@@ -314,7 +314,7 @@ def test_importance_from_25_trials_and_a_pareto_front_open_a_run(browser: Browse
     spaces = {key: optuna.distributions.FloatDistribution(0, 1) for key in ("loss.hand", "lr")}
 
     def add_trial(number: int) -> None:
-        values = [number, 26 - number if number % 2 else 25]  # the odd ones are on the front, 13 in its middle
+        values = [number, 26 - number if number % 2 else 25]  # odd ones: the front, 13 its middle
         params = {"loss.hand": number / 25, "lr": number * 7 % 25 / 25}
         about = {"distributions": spaces, "user_attrs": {"runs": [run.id] if number == 13 else []}}
         study.study.add_trial(optuna.trial.create_trial(params=params, values=values, **about))
