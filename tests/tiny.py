@@ -99,7 +99,7 @@ BASELINES: dict[str, dict[str, Any]] = {
     ),
     "bodiffusion": dict(
         frames=7, width=48, depth=2, heads=3, diffusion_steps=50, sampling_steps=3, noise_seed=0,
-        noise_weight=1.0, bound_weight=1.0, offline=False,
+        noise_weight=1.0, bound_weight=1.0, offline=False, sampler="ancestral",
     ),
     "avatar_poser": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
     "ego_poser": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),

@@ -15,10 +15,15 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.settings import at_least, positive, setting, tuned
+from memmlp.common.settings import at_least, one_of, positive, setting, tuned
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.diffusion import AncestralDiffusion, DenoiserOutput, TimeEmbedding
+from memmlp.networks.diffusion import (
+    AncestralDiffusion,
+    DenoiserOutput,
+    ReleasedAncestralDiffusion,
+    TimeEmbedding,
+)
 from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
 from memmlp.networks.settings import NetworkSettings, Release, name_dit_blocks
 from memmlp.networks.streaming import StemGraph, make_linear
@@ -92,7 +97,7 @@ class BoDiffusionSettings(NetworkSettings):
 
     The published network needs model.offline=true evaluation.modes=[window] export.graph=off. It denoises a
     clip's overlapping windows together. Loss (noise, variational bound), noise schedule, features and
-    averaged weights follow its released code. Its number of sampling steps is not published. The training
+    averaged weights follow its released code. Its test takes 999 sampling steps by default. The training
     settings differ: AdamW with the profile's schedule, instead of 1e-5 without weight decay.
     """
 
@@ -102,9 +107,10 @@ class BoDiffusionSettings(NetworkSettings):
     depth: int = setting(at_least(1), tiny=2, small=4, paper=12)  # number of blocks
     heads: int = setting(at_least(1), tiny=4, small=3, paper=6)  # number of attention heads
     diffusion_steps: int = setting(at_least(1), 1000)  # number of steps in the linear noise schedule
-    # number of denoiser calls per window; each call adds noise, except the last call and calls within the
-    # last 50 steps of the schedule
-    sampling_steps: int = setting(at_least(1), tiny=2, small=10, paper=25)
+    sampling_steps: int = setting(at_least(1), tiny=2, small=10, paper=25)  # denoiser calls per window
+    # ancestral: each call adds noise, except the last call and calls within the last 50 steps of the
+    # schedule; released: times, noise and limits of the released code
+    sampler: str = setting(one_of("ancestral", "released"), "ancestral")
     noise_seed: int = setting(at_least(0), 0)  # seed of the sampling noise, equal for all windows
     noise_weight: float = setting(at_least(0), 1.0)  # weight of the loss for the predicted noise
     # weight of the variational bound, which trains the variances
@@ -136,7 +142,13 @@ class BoDiffusionSettings(NetworkSettings):
             "model.width": ("pos_embed", 2),
             "model.depth": "blocks.*.attn.qkv.weight",
         },
-        config={"model.offline": True, "evaluation.modes": ["window"], "export.graph": "off"},
+        config={
+            "model.offline": True,
+            "evaluation.modes": ["window"],
+            "export.graph": "off",
+            "model.sampler": "released",
+            "model.sampling_steps": 999,
+        },
     )
 
     @classmethod
@@ -145,6 +157,9 @@ class BoDiffusionSettings(NetworkSettings):
         yield from super().problems(config)
         if config["loss"]["name"] == "of_network" and not config["model"]["noise_weight"]:
             yield "model.noise_weight=0: must be above 0 with loss=of_network"
+        calls, steps = config["model"]["sampling_steps"], config["model"]["diffusion_steps"]
+        if config["model"]["sampler"] == "released" and not 1 < calls < steps:
+            yield f"model.sampling_steps={calls}: must be from 2 to {steps - 1} with model.sampler=released"
 
 
 class BoDiffusion(WindowModel):
@@ -165,7 +180,8 @@ class BoDiffusion(WindowModel):
         self.noise_weight, self.bound_weight = settings.noise_weight, settings.bound_weight
         self.noise_seed = settings.noise_seed
         self.is_stream, self.takes_whole_clip = not settings.offline, settings.offline
-        self.diffusion = AncestralDiffusion(settings.diffusion_steps, settings.sampling_steps)
+        sampler = {"ancestral": AncestralDiffusion, "released": ReleasedAncestralDiffusion}[settings.sampler]
+        self.diffusion = sampler(settings.diffusion_steps, settings.sampling_steps)
         self.time = TimeEmbedding(settings.width, SINES)
         self.spread = nn.Linear(len(TRACKED), N_JOINTS, bias=False)
         self.stem = nn.Linear(N_JOINTS * (NOISY + CHANNELS), settings.width)
@@ -173,14 +189,19 @@ class BoDiffusion(WindowModel):
         self.blocks = nn.ModuleList(DiTBlock(settings.width, settings.heads) for _ in range(settings.depth))
         self.head = nn.Linear(settings.width, N_JOINTS * (NOISY + CHANNELS))
         self.joint_head = nn.Linear(NOISY + CHANNELS, 2 * NOISY)
-        self.register_buffer(
-            "noises", self.draw_noise(settings.frames), persistent=False
-        )  # more with more sampling steps
+        noises = torch.stack(list(self.draw_noise(settings.frames)))  # more with more sampling steps
+        self.register_buffer("noises", noises, persistent=False)
 
-    def draw_noise(self, frames: int) -> Tensor:
-        """Draw the noise (draws, N, 132) for a sample of N frames, always with `noise_seed`."""
+    def draw_noise(self, frames: int) -> Iterator[Tensor]:
+        """Draw the noise (N, 132) of each draw for a sample of N frames, always with `noise_seed`.
+
+        Four draws at a time save memory. They equal one call for all draws, because torch fills 16 numbers at
+        a time.
+        """
         draw = torch.Generator().manual_seed(self.noise_seed)
-        return torch.randn(self.diffusion.noise_draws, frames, ROTATION.stop, generator=draw)
+        for first in range(0, self.diffusion.noise_draws, 4):
+            count = min(4, self.diffusion.noise_draws - first)
+            yield from torch.randn(count, frames, ROTATION.stop, generator=draw)
 
     def compute_limits(self) -> tuple[Tensor, Tensor]:
         """Return the limits of 6D rotations, -1 and 1, in network space: lower and upper limits (132,)."""
@@ -241,7 +262,7 @@ class BoDiffusion(WindowModel):
             mean, variance = self.step(noisy[windows], encoded, index)
             return sum_parts(mean) / times_covered, sum_parts(variance).sqrt() / times_covered
 
-        rotation = self.diffusion.sample(step, self.draw_noise(count).to(self.noises))
+        rotation = self.diffusion.sample(step, (noise.to(self.noises) for noise in self.draw_noise(count)))
         return self.normalizer.decode_rotations(rotation, sparse)
 
     def compute_training_outputs(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:

@@ -1,7 +1,8 @@
 """Denoising diffusion: noise schedules, noise for training signals, and sampling."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import accumulate, repeat
 from typing import NamedTuple
 
 import torch
@@ -41,8 +42,7 @@ class NoiseProcess(nn.Module):
     Args:
         signal: at each diffusion time, the fraction (steps,) of a noisy signal's variance that is due to
             the clean signal.
-        sampling_steps: number of denoiser calls for a sample. Their times are evenly spaced and start at the
-            schedule's last step, pure noise (Song et al. 2021, App. D.2: linear).
+        sampling_steps: number of sampling times; see `space_times`.
     """
 
     signal: Tensor
@@ -50,8 +50,16 @@ class NoiseProcess(nn.Module):
     def __init__(self, signal: Tensor, sampling_steps: int):
         super().__init__()
         self.steps = len(signal)
-        self.times = [self.steps * (i + 1) // sampling_steps - 1 for i in reversed(range(sampling_steps))]
+        self.times = self.space_times(sampling_steps)
         self.register_buffer("signal", signal.float(), persistent=False)
+
+    def space_times(self, count: int) -> list[int]:
+        """Return `count` sampling times, the noisiest first.
+
+        They are evenly spaced and start at the schedule's last step, pure noise (Song et al. 2021, App. D.2:
+        linear).
+        """
+        return [self.steps * (i + 1) // count - 1 for i in reversed(range(count))]
 
     def draw_times(self, clean: Tensor) -> Tensor:
         """Draw a time (B,) for each signal of a batch (B, ...)."""
@@ -134,9 +142,8 @@ class StridedDiffusion(Diffusion):
     signal at time 0. The released code calls the denoiser once more, without an effect on its sample.
     """
 
-    def __init__(self, steps: int, sampling_steps: int):
-        super().__init__(steps, sampling_steps)
-        self.times = make_strided_times(steps, sampling_steps)
+    def space_times(self, count: int) -> list[int]:
+        return make_strided_times(self.steps, count)
 
     @property
     def calls(self) -> int:
@@ -155,9 +162,11 @@ class PosteriorDiffusion(Diffusion):
 
     def __init__(self, steps: int, sampling_steps: int):
         super().__init__(steps, sampling_steps)
-        self.times = make_strided_times(steps, sampling_steps)
         posterior = compute_posterior(make_cosine_schedule(steps)[self.times[::-1]]).flip(-1)
         self.register_buffer("posterior", posterior.float(), persistent=False)
+
+    def space_times(self, count: int) -> list[int]:
+        return make_strided_times(self.steps, count)
 
     @property
     def noise_draws(self) -> int:
@@ -173,9 +182,8 @@ class PosteriorDiffusion(Diffusion):
 
 SamplingStep = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 """Maps a noisy signal and its sampling step to mean and standard deviation of the next signal."""
-FIRST_NOISY_TIME = (
-    50  # from this time of the noise schedule on a sample takes the mean; BoDiffusion's code has 49
-)
+FIRST_NOISY_TIME = 50  # from this time of the noise schedule on a sample takes the mean
+NOISELESS_CALLS = 49  # with which a sample ends in BoDiffusion's released code
 BIN = 2 / 255  # the width of the bins of the first step's likelihood: a pixel's, as BoDiffusion's code has it
 
 
@@ -221,6 +229,7 @@ class AncestralDiffusion(NoiseProcess):
         sampling_steps: number of denoiser calls for a sample; see NoiseProcess.
     """
 
+    clamps_last_estimate = False
     trained: Tensor
     spaced: Tensor
 
@@ -283,8 +292,8 @@ class AncestralDiffusion(NoiseProcess):
     ) -> tuple[Tensor, Tensor]:
         """Return mean and variance (B, ...) of the signal after a sampling step.
 
-        The last step's estimate is not clamped to the limits: if the network has not learned a rotation,
-        clamping could make the two columns of its 6D form parallel, which is not a rotation.
+        The last step's estimate is clamped to the limits only as released: if the network has not learned a
+        rotation, clamping could make the two columns of its 6D form parallel, which is not a rotation.
 
         Args:
             noisy: the noisy signal (B, ...) at sampling step `index`.
@@ -295,18 +304,39 @@ class AncestralDiffusion(NoiseProcess):
         time = torch.full((1,), self.times[index], device=noisy.device)
         first, second, least, largest = self.spaced[:, index]
         clean = self.remove_noise(noisy, predicted.noise, time)
-        if index + 1 < len(self.times):
+        if index + 1 < len(self.times) or self.clamps_last_estimate:
             clean = clean.clamp(*limits)
         mean = first * clean + second * noisy
         return mean, (least + (predicted.variance_fraction + 1) / 2 * (largest - least)).exp()
 
-    def sample(self, step: SamplingStep, noise: Tensor) -> Tensor:
-        """Sample a clean signal (...) with the given noise (`noise_draws`, ...)."""
-        x, *further = noise
+    def sample(self, step: SamplingStep, noise: Iterable[Tensor]) -> Tensor:
+        """Sample a clean signal (...) with the given noise (...) of each draw (`noise_draws`)."""
+        draws = iter(noise)
+        x = next(draws)
         for index in range(len(self.times)):
             mean, deviation = step(x, index)
-            x = mean + deviation * further[index] if index < len(further) else mean
+            further = next(draws, None)
+            x = mean if further is None else mean + deviation * further
         return x
+
+
+class ReleasedAncestralDiffusion(AncestralDiffusion):
+    """Ancestral sampling as in BoDiffusion's released code.
+
+    Its times are evenly spaced from the schedule's first to its last step. A sample starts at the second
+    noisiest time, so the released code's respacing to N times has N - 1 denoiser calls. The last 49 calls do
+    not add noise, whatever their times.
+    """
+
+    clamps_last_estimate = True
+
+    def space_times(self, count: int) -> list[int]:
+        stride = (self.steps - 1) / count  # the sum's rounding decides ties
+        return [round(time) for time in accumulate(repeat(stride, count - 1), initial=0.0)][::-1]
+
+    @property
+    def noise_draws(self) -> int:
+        return 1 + max(len(self.times) - NOISELESS_CALLS, 0)
 
 
 def compute_negative_log_likelihood(

@@ -73,6 +73,7 @@ REFUSED = [
     (["model=agrol_mlp", "memory.width=4"], "memory.width"),
     (["model=avatar_poser", "model.heads=7"], "model.heads"),
     (["model=agrol_diffusion", "model.sampling_steps=2000"], "model.sampling_steps"),
+    ([*OFFLINE, "model.sampler=released", "model.sampling_steps=1"], "model.sampling_steps=1: must be"),
     (["loss=agrol"], "predictor=rotation_only hand=off"),
     (["loss=agrol", "predictor=rotation_only", "hand=fk"], "predictor=rotation_only hand=off"),
     (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),

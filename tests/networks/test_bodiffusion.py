@@ -47,13 +47,13 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
 def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypatch):
     """Window by window and frame by frame, with steps that add noise."""
     monkeypatch.setattr(ancestral, "FIRST_NOISY_TIME", 1)
-    model = tiny.baseline("bodiffusion", offline=True, sampling_steps=2, depth=1).double()
+    model = tiny.baseline("bodiffusion", offline=True, sampling_steps=6, depth=1).double()
     sparse = CLIP[:, :SPARSE_DIM].double()
-    noise = torch.randn(2, 25, 132, generator=torch.Generator().manual_seed(0)).double()
+    noise = torch.randn(6, 25, 132, generator=torch.Generator().manual_seed(0)).double()
     found = model.predict_clip(sparse)
     encoded = model.normalizer.encode_sparse(sparse, model.normalizer.find_origin(sparse))
     x = noise[0]
-    for index in range(2):
+    for index in range(6):
         sums, variances, covered = torch.zeros_like(x), torch.zeros_like(x), torch.zeros(25, 1)
         for begin in (0, 3, 6, 9, 12, 15, 18):
             part = slice(begin, begin + 7)
@@ -61,7 +61,7 @@ def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypat
             sums[part] += mean[0]
             variances[part] += variance[0]
             covered[part] += 1
-        x = sums / covered + (variances.sqrt() / covered * noise[1] if index == 0 else 0)
+        x = sums / covered + (variances.sqrt() / covered * noise[index + 1] if index < 5 else 0)
     torch.testing.assert_close(found, model.normalizer.decode_rotations(x, sparse), atol=1e-9, rtol=0)
 
 

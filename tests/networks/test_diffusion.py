@@ -8,7 +8,12 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from memmlp.networks import diffusion as module
-from memmlp.networks.diffusion import AncestralDiffusion, DenoiserOutput, Diffusion
+from memmlp.networks.diffusion import (
+    AncestralDiffusion,
+    DenoiserOutput,
+    Diffusion,
+    ReleasedAncestralDiffusion,
+)
 
 
 @pytest.mark.parametrize("steps", [1, 3, 5])
@@ -59,12 +64,14 @@ def made(noisy: torch.Tensor, time: torch.Tensor) -> DenoiserOutput:
     return DenoiserOutput(0.7 * noisy + 0.01 * time.view(-1, 1, 1), 0.1 * noisy - 0.3)
 
 
-@pytest.mark.parametrize("count", [1, 4, 53])
-def test_sampling_is_an_independent_numpy_computation(count):
-    """Estimates are kept within limits but for the last; noise is added but at the end and below time 50."""
-    diffusion, rng = AncestralDiffusion(60, count).double(), np.random.default_rng(0)
+@pytest.mark.parametrize(("released", "count"), [(0, 1), (0, 4), (0, 53), (1, 4), (1, 53)])
+def test_sampling_is_an_independent_numpy_computation(released, count):
+    """Estimates are kept within limits but for the last; noise is added but at the end and below time 50. As
+    released, all estimates are kept within limits, and the last 49 steps add no noise."""
+    kind = ReleasedAncestralDiffusion if released else AncestralDiffusion
+    diffusion, rng = kind(60, count).double(), np.random.default_rng(0)
     noise = rng.normal(size=(diffusion.noise_draws, 2, 4, 3))
-    limits = torch.tensor(-1.0), torch.tensor(1.5)
+    limits = torch.tensor(-2.0), torch.tensor(-1.0)
 
     def step(x: torch.Tensor, index: int) -> tuple[torch.Tensor, torch.Tensor]:
         times = torch.full((2,), diffusion.times[index])
@@ -72,17 +79,29 @@ def test_sampling_is_an_independent_numpy_computation(count):
         return mean, variance.sqrt()
 
     found = diffusion.sample(step, torch.tensor(noise))
-    times = [60 * k // count - 1 for k in range(1, count + 1)]
+    times = [round(59 * k / count) if released else 60 * (k + 1) // count - 1 for k in range(count)]
     first, second, least, largest = tables(kept(60)[times]) if count > 1 else (np.ones(1), *np.zeros((3, 1)))
     x = noise[0]
     for i, t in reversed(list(enumerate(times))):
         clean = (x - np.sqrt(1 - kept(60)[t]) * (0.7 * x + 0.01 * t)) / np.sqrt(kept(60)[t])
         share = (0.1 * x - 0.3 + 1) / 2
-        x = first[i] * (np.clip(clean, -1, 1.5) if i else clean) + second[i] * x
-        if i and t >= 50:
+        x = first[i] * (np.clip(clean, -2, -1) if i or released else clean) + second[i] * x
+        if i >= 49 if released else i and t >= 50:
             x = x + np.sqrt(largest[i] ** share * least[i] ** (1 - share)) * noise[count - i]
-    assert len(noise) == {1: 1, 4: 2, 53: 9}[count]
+    assert len(noise) == ({4: 1, 53: 5} if released else {1: 1, 4: 2, 53: 9})[count]
     np.testing.assert_allclose(found.numpy(), x, atol=1e-4)
+
+
+def test_the_released_times_are_a_rounded_running_sum_without_its_last():
+    """Of the respacing to 5 times, 0, 250, 500, 749 and 999, and of longer ones."""
+    for count in (4, 9, 20, 24):
+        sums = [0.0]
+        while len(sums) < count:
+            sums.append(sums[-1] + 999 / count)
+        assert ReleasedAncestralDiffusion(1000, count).times[::-1] == [round(one) for one in sums]
+    assert ReleasedAncestralDiffusion(1000, 4).times == [749, 500, 250, 0]
+    assert ReleasedAncestralDiffusion(1000, 20).times[9] == 499  # not 500
+    assert ReleasedAncestralDiffusion(1000, 999).times == list(range(999))[::-1]
 
 
 def test_the_losses_are_an_independent_numpy_computation():
