@@ -180,13 +180,12 @@ def add_package(package: str, root: Path | None) -> None:
 
 
 def _parse_components(package: str, path: Path) -> Iterable[Component]:
-    text = path.read_text(encoding="utf-8")
-    if "\n@component(" not in text:
+    if b"\n@component(" not in (content := path.read_bytes()):
         return
     root = _roots[package]
     below = path.relative_to(root).with_suffix("").parts if path != root else ()
     module = ".".join([package, *(part for part in below if part != "__init__")])
-    for slot, name, more in DECORATOR.findall(text):
+    for slot, name, more in DECORATOR.findall(content.decode()):
         version, builds = re.search(r"version=(\d+)", more), re.search(r'builds="(\w+)"', more)
         number = int(version[1]) if version else 1
         yield Component(slot, name, number, builds[1] if builds else None, package, module, path)

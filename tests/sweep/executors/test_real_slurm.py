@@ -188,7 +188,7 @@ def find_running_job() -> str:
 
 
 def test_a_sweep_of_jobs_that_time_out_ends_as_an_undisturbed_one(cluster: Path, trial: Trial):
-    trial.set_pace(1.0)
+    trial.set_pace(1.5)
     controller = trial.start("timed", "executor=slurm", "slurm.time=1")
 
     def count_trainings() -> int:
