@@ -112,7 +112,7 @@ BASELINES: dict[str, dict[str, Any]] = {
     "rpm": dict(frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
     ),
     "manikin_s": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.0, parts_weight=1.0,
-        turned=True,
+        root_weight=0.0, turned=True,
     ),
     "manikin_l": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse_weight=1.0,
         parts_weight=1.0, turned=True, offline=False,

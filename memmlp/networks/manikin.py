@@ -247,6 +247,9 @@ class ManikinSSettings(AvatarPoserSettings):
     dropout: float = setting(fraction(), 0.0)  # dropout in the encoder during training
     # weight of the losses for the limb solver's inputs: trunk, swivel angles, elbows, knees, ankles and toes
     parts_weight: float = setting(at_least(0), 1.0)
+    # weight of the loss for the root's 6D columns before they are made orthonormal; 0.02 with
+    # loss.orientation=0 as in the released code
+    root_weight: float = setting(at_least(0), 0.0)
     turned: bool = setting(default=True)  # true: rotate training windows to random headings
 
     defaults: ClassVar = {"loss": "manikin_s"}
@@ -272,6 +275,7 @@ class ManikinS(Manikin, AvatarPoser):
     def __init__(self, normalizer: Normalizer, settings: ManikinSSettings):
         super().__init__(normalizer, settings)
         self.parts_weight, self.turned = settings.parts_weight, settings.turned
+        self.root_weight = settings.root_weight
         self.swivel, self.places = make_head(settings.width, SWIVELS), make_head(settings.width, PLACES)
         for added in (self.swivel, self.places):
             initialize_weights(added)
@@ -300,8 +304,9 @@ class ManikinS(Manikin, AvatarPoser):
         up, angle = turned[..., list(BASES), :, 1].detach(), F.normalize(parts.swivel, dim=-1)
         lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
         rooted = (truth.joints - truth.joints[..., ROOT : ROOT + 1, :])[..., PLACED_JOINTS, :]
+        root = {"root": self.root_weight * F.l1_loss(parts.sixd[..., 0, :], truth.sixd[..., ROOT, :])}
         limbs = len(BASES)
-        return {
+        return (root if self.root_weight else {}) | {
             "trunk_rotation": F.l1_loss(parts.sixd[..., 1:, :], truth.sixd[..., list(PREDICTED_JOINTS), :]),
             "trunk_position": 5 * F.l1_loss(joints[..., PLACED_JOINTS, :], rooted),
             "swivel": 0.1 * 2 * limbs * F.l1_loss(parts.swivel, measure_swivels(base, middle, end, up)),

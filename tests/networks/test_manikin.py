@@ -66,7 +66,7 @@ def filled(sixd: np.ndarray) -> np.ndarray:
 
 def test_manikin_s_losses_are_an_independent_computation():
     """In NumPy, limb by limb, with the weights of its authors."""
-    model = in_world("manikin_s")
+    model = in_world("manikin_s", root_weight=0.02)
     noise = torch.randn(2, 1, 86, generator=torch.Generator().manual_seed(1)).double()
     made = outputs()[:, -1:] + 0.1 * noise
     found = model.compute_part_losses(made, TrueParts(MOTION[:, -1:]))
@@ -97,6 +97,7 @@ def test_manikin_s_losses_are_an_independent_computation():
     expected = {
         "trunk_rotation": np.mean(rotations), "trunk_position": 5 * np.mean(rooted), "swivel": 0.1 * swivel,
         "middle": middle, "ankle": 5 * np.mean(ankles), "toe": 0.3 * np.mean(toes),
+        "root": 0.02 * np.abs(raw[:, :6] - sixd[:, 0]).mean(),
     }  # fmt: skip
     assert {name: float(term) for name, term in found.items()} == pytest.approx(expected, rel=1e-3)
 
