@@ -1,5 +1,6 @@
 """Settings and fixtures that all tests share."""
 
+import copy
 import functools
 import logging
 import math
@@ -92,9 +93,13 @@ def _no_process_is_left() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _parse_interpolations_once() -> None:
-    """OmegaConf parses each `${seed}` again, which is a third of a composition."""
+def _parse_once() -> None:
+    """OmegaConf parses each `${seed}` again, and Hydra each override thrice: most of a composition."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
     omegaconf.base.parse = functools.lru_cache(maxsize=1000)(omegaconf.base.parse)
+    parse = functools.lru_cache(maxsize=9000)(OverridesParser.create().parse_rule)
+    OverridesParser.parse_rule = lambda self, text, rule: copy.copy(parse(text, rule))
 
 
 def shared(factory: pytest.TempPathFactory, name: str) -> Path:

@@ -15,8 +15,14 @@ from memmlp.runs.loggers.mlflow import MLflow
 from memmlp.runs.lookup import add_tags, remove_tags, set_note
 from memmlp.runs.run import Run
 
-pytest.importorskip("mlflow")
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _needs_mlflow() -> None:
+    """Not imported by each test process."""
+    pytest.importorskip("mlflow")
+
 
 CONFIG = {"data": {"name": "mine"}, "seed": 0, "memory": {"layers": [2, 4]}, "long": "x" * 7000}
 

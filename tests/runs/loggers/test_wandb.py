@@ -15,8 +15,13 @@ from memmlp.runs.loggers.logger import Session, sync_runs
 from memmlp.runs.loggers.wandb import WandB
 from memmlp.runs.lookup import add_tags
 
-pytest.importorskip("wandb")
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _needs_wandb() -> None:
+    """Not imported by each test process."""
+    pytest.importorskip("wandb")
 
 
 @pytest.fixture(autouse=True)
