@@ -10,7 +10,7 @@ from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.runs.lookup import DEFAULT, read_card
 
 TINY = [
-    "executor=debug", "profile=tiny", "data.synth.minutes=1", "optim.steps=2", "vqvae.steps=2",
+    "executor=debug", "profile=tiny", "model.depth=2", "data.synth.minutes=0.1", "optim.steps=2", "vqvae.steps=2",
     "optim.validate_every=2", "threads=1",
 ]  # fmt: skip
 
