@@ -18,8 +18,8 @@ MARK = "MEMMLP_TESTS"
 PATIENCE = 900.0  # seconds until a wait fails, even on a very busy machine
 SERVERS = (b"multiprocessing.resource_tracker", b"multiprocessing.forkserver")  # they end with this process
 PRELOADED = [
-    "memmlp.cli.main", "memmlp.config.build", "memmlp.training.run_stages", "memmlp.deploy.export", "torch._dynamo",
-    "scipy.interpolate",
+    "memmlp.cli.main", "memmlp.config.build", "memmlp.training.run_stages", "memmlp.deploy.export",
+    "torch._dynamo", "scipy.interpolate",
 ]  # fmt: skip
 
 

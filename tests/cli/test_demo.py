@@ -10,8 +10,8 @@ from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.runs.lookup import DEFAULT, read_card
 
 TINY = [
-    "executor=debug", "profile=tiny", "model.depth=2", "data.synth.minutes=0.1", "optim.steps=2", "vqvae.steps=2",
-    "optim.validate_every=2", "threads=1",
+    "executor=debug", "profile=tiny", "model.depth=2", "data.synth.minutes=0.1", "threads=1",
+    "optim.steps=2", "vqvae.steps=2", "optim.validate_every=2",
 ]  # fmt: skip
 
 
