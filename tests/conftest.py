@@ -27,6 +27,8 @@ if Path("/dev/nvidiactl").exists():
 THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
 SLOW_TIMEOUT = 3600  # seconds, on a machine with much other work
 INT8 = "export.precision=int8"
+FIRST = {f"test_{name}.py" for name in ("experiment", "kills", "networks", "page", "run_stages", "tune")}
+"""The files that take longest: after all others they would leave cores idle."""
 # The same examples each time, and no complaint that a busy machine is slow.
 settings.register_profile(
     "memmlp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
@@ -39,14 +41,14 @@ logging.getLogger("torch.__trace").addHandler = lambda handler: None  # type: ig
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long tests and those that need a trained run are slow; files with slow tests come first."""
+    """Long tests and those that need a trained run are slow; files with slow tests come early."""
     for item in items:
         if {"home", "tiny_home"} & set(item.fixturenames) or item.get_closest_marker("long"):
             item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT))
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (item.path.name not in FIRST, item.path not in slow))
 
 
 @pytest.hookimpl(trylast=True)
