@@ -76,9 +76,7 @@ START = [line for line in LINES if line.page == "README.md" or line.page.startsw
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "line",
-    [line if line in START else pytest.param(line, marks=pytest.mark.long) for line in LINES],
-    ids=str,
+    "line", [line if line in START else pytest.param(line, marks=pytest.mark.long) for line in LINES], ids=str
 )
 def test_commands_are_valid(line: Line, on_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)

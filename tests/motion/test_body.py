@@ -7,12 +7,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.motion.body import (
-    RECORD,
-    check_imported_body,
-    describe_body,
-    make_builtin_rest_joints,
-)
+from memmlp.motion.body import RECORD, check_imported_body, describe_body, make_builtin_rest_joints
 
 BUILTIN, OTHER = make_builtin_rest_joints(), 1.1 * make_builtin_rest_joints()
 

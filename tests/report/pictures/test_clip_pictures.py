@@ -13,11 +13,7 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation.modes import extract_positions
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.report.pictures import clip_pictures
-from memmlp.report.pictures.clip_pictures import (
-    ClipPiece,
-    check_picture_path,
-    write_picture,
-)
+from memmlp.report.pictures.clip_pictures import ClipPiece, check_picture_path, write_picture
 
 TRUTH = extract_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 OFF = np.array([0.0, 0.0, 0.08])

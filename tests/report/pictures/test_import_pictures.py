@@ -17,13 +17,7 @@ from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.importing.convert import view_stance
 from memmlp.motion.importing.skeleton_map import find_skeleton
 from memmlp.motion.synthetic import synthesize_clip
-from memmlp.report.pictures.import_pictures import (
-    LEFT,
-    MIDDLE,
-    RIGHT,
-    read_sample,
-    write_skeleton_picture,
-)
+from memmlp.report.pictures.import_pictures import LEFT, MIDDLE, RIGHT, read_sample, write_skeleton_picture
 
 
 @pytest.fixture

@@ -13,13 +13,7 @@ import pytest
 import yaml
 from command_line import BRIEF, MAIN
 from processes import until
-from sweep.executors.slurm_cluster import (
-    find_missing_commands,
-    list_ends,
-    list_jobs,
-    running_cluster,
-    slurm,
-)
+from sweep.executors.slurm_cluster import find_missing_commands, list_ends, list_jobs, running_cluster, slurm
 
 from benchmarks import chaos
 from memmlp.common.files import atomic_write, file_digest

@@ -8,12 +8,7 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.sweep.executors import slurm
 from memmlp.sweep.executors.local import HEARTBEAT
-from memmlp.sweep.executors.slurm import (
-    Slurm,
-    SlurmOptions,
-    format_batch_script,
-    parse_slurm_options,
-)
+from memmlp.sweep.executors.slurm import Slurm, SlurmOptions, format_batch_script, parse_slurm_options
 
 
 def lines(tmp_path: Path, **words: str) -> list[str]:
