@@ -1,14 +1,15 @@
-"""Change random lines of the package, one at a time: do the tests of its module fail?
+"""Change random lines of the package, one at a time: do the tests of its folder fail?
 
     python benchmarks/mutants.py --count 20 --seed 0
 
-Each mutant is tested in a copy of the checkout, by the test file that mirrors its module, or else by its
+Each mutant is tested in a copy of the checkout, by the test file that mirrors its module, then by its
 folder's tests. Exits with 1 if a mutant survives: a test is missing, or the change makes no difference.
 """
 
 import argparse
 import ast
 import functools
+import itertools
 import os
 import random
 import shutil
@@ -22,10 +23,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-import torch  # noqa: F401
+import torch
 
 ROOT = Path(__file__).resolve().parent.parent
 TIMEOUT = 1800  # seconds; a mutant that makes the tests hang so long counts as killed
+MARKERS = "not slow and not long", "slow and not long"
 OTHER: dict[type, str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==",
     ast.In: "not in", ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",
@@ -114,18 +116,12 @@ def draw(count: int, seed: int, skip: list[str]) -> list[Mutant]:
     return [dice.choice(lines[line]) for line in dice.sample(sorted(lines), count)]
 
 
-def find_tests(file: Path) -> Path:
-    """The test file of a module or of its folder, or the nearest folder of tests."""
+def find_tests(file: Path) -> list[Path]:
+    """The test file of a module or of its folder, then the tests of its folder and of the folders above."""
     place = Path("tests", *file.parts[1:])
-    candidates = [
-        (path.with_name(f"test_{path.stem}.py"), path) for path in (place, *list(place.parents)[:-1])
-    ]
-    return next(path for pair in candidates for path in pair if (ROOT / path).exists())
-
-
-@functools.cache
-def sound(root: Path, tests: Path, marker: str) -> bool:
-    return passes(root, tests, marker)
+    parts = (place, *place.parents)[:-2]
+    candidates = [path for part in parts for path in (part.with_name(f"test_{part.stem}.py"), part)]
+    return [path for path in candidates if (ROOT / path).exists()] or [Path("tests")]
 
 
 def passes(root: Path, tests: Path, marker: str) -> bool:
@@ -145,31 +141,35 @@ def passes(root: Path, tests: Path, marker: str) -> bool:
     return False
 
 
+passes_unchanged = functools.cache(passes)
+
+
 def run_tests(root: Path, tests: Path, marker: str) -> int:
     """Run tests of a copy with its own code; return pytest's exit code."""
     os.chdir(root)
     os.environ |= {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
     sys.path.insert(0, str(root))
     sys.dont_write_bytecode = True
+    torch.set_num_threads(1)  # tests/conftest.py sets it in the environment, too late here
     silence = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):
         os.dup2(silence, stream)
     return int(pytest.main(["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", marker, str(tests)]))
 
 
-def survives(root: Path, mutant: Mutant) -> bool:
-    """Whether a mutant passes its tests, the quick ones first."""
-    tests = find_tests(mutant.file)
-    for marker in ("not slow and not long", "slow and not long"):
-        if not sound(root, tests, marker):
-            sys.exit(f"{tests}: fails without a mutant")
+def find_killer(root: Path, mutant: Mutant) -> Path | None:
+    """The tests that fail with a mutant, the quick ones first; None if it survives."""
+    for tests, marker in itertools.product(find_tests(mutant.file), MARKERS):
         mutant.apply(root)
         try:
-            if not passes(root, tests, marker):
-                return False
+            survived = passes(root, tests, marker)
         finally:
             shutil.copy2(ROOT / mutant.file, root / mutant.file)
-    return True
+        if not survived:
+            if not passes_unchanged(root, tests, marker):
+                sys.exit(f"{tests}: fails without a mutant")
+            return tests
+    return None
 
 
 def copy_checkout(folder: str) -> Path:
@@ -194,10 +194,10 @@ def main() -> None:
         root = copy_checkout(folder)
         survivors = 0
         for number, mutant in enumerate(chosen, 1):
-            survived = not words.dry_run and survives(root, mutant)
-            verdict = "drawn" if words.dry_run else "survived" if survived else "killed"
-            print(f"{number:3} {verdict:8} {mutant} [{find_tests(mutant.file)}]", flush=True)
-            survivors += survived
+            killer = None if words.dry_run else find_killer(root, mutant)
+            verdict = f"killed by {killer}" if killer else "drawn" if words.dry_run else "survived"
+            print(f"{number:3} {verdict}: {mutant}", flush=True)
+            survivors += verdict == "survived"
     sys.exit(survivors > 0)
 
 
