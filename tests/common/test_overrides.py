@@ -2,7 +2,7 @@
 
 import pytest
 
-from memmlp.common.overrides import Override, select_last_by_key
+from memmlp.common.overrides import Override, flatten, select_last_by_key
 
 
 @pytest.mark.parametrize(("text", "parts"), [
@@ -25,3 +25,7 @@ def test_the_options_that_an_override_names(text: str, options: list[str]):
 
 def test_the_last_override_of_a_key_wins_at_the_first_ones_place():
     assert [str(one) for one in select_last_by_key(["a=1", "b=2", "+a=3"]).values()] == ["+a=3", "b=2"]
+
+
+def test_only_mappings_are_flattened():
+    assert flatten({"a": {"b": [{"c": 1}], "d": {}}, "e": None}) == {"a.b": [{"c": 1}], "a.d": {}, "e": None}

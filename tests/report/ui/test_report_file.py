@@ -1,8 +1,10 @@
 """What `memmlp report` puts into the page's file."""
 
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-from memmlp.report.ui.report_file import _shorten_run_page, encode_query, round_numbers
+from memmlp.report.ui.report_file import _select_sweeps, _shorten_run_page, encode_query, round_numbers
 
 
 def clip(name: str, error: Any) -> dict[str, Any]:
@@ -14,6 +16,13 @@ def test_clips_without_a_number_are_the_worst():
     clips = [clip("good", 3.0), clip("nan", "nan"), clip("bad", 9.0), {"name": "none"}, clip("inf", "inf")]
     kept = _shorten_run_page({"clips": clips, "manifest": {}, "log": ""})["clips"]
     assert [one["name"] for one in kept] == ["nan", "inf", "bad", "good", "none"]
+
+
+def test_names_choose_sweeps():
+    known = {"table05-a": "a", "table05-b": "b", "mine": "m"}
+    answers: Any = SimpleNamespace(outputs=Path(), sweeps=SimpleNamespace(known=known))
+    for names, shown in (([], "abm"), (["5"], "ab"), (["x/mine.yaml", "table05-b"], "mb")):
+        assert "".join(_select_sweeps(answers, names).values()) == shown
 
 
 def test_addresses_and_numbers_of_the_file():
