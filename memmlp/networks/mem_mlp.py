@@ -101,9 +101,12 @@ class MemMLPGraph(StreamingGraph):
         "conversions",
         "stem",
         "recall.memory.recurrences",
+        "recall.memory.codes",
+        "recall.whole",
         "predictor.rotation.linear",
         "predictor.position.linear",
     )
+    int16_modules = ("blocks", "predictor")
 
     @classmethod
     def fits(cls, model: Any) -> bool:

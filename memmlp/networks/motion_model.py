@@ -264,9 +264,12 @@ class StreamingGraph(nn.Module):
     Attributes:
         float32_modules: names of the modules that stay in float32 when the graph is quantised. They are the
             network's first and last layers, and other layers with visible rounding.
+        int16_modules: names of the modules whose newest frame has sixteen bits in an int8 file. The last row
+            of their inputs is the newest frame.
     """
 
     float32_modules: tuple[str, ...]
+    int16_modules: tuple[str, ...] = ()
 
     def __init__(self, model: MotionModel):
         super().__init__()

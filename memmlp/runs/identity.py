@@ -49,7 +49,7 @@ VERSIONS: dict[str, int] = {
     "export": 1,
     "graph.streaming": 1,
     "graph.naive": 1,
-    "int8": 3,
+    "int8": 4,
     "fp16": 3,
     "latency": 1,
 }

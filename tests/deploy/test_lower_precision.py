@@ -15,7 +15,7 @@ from onnx import TensorProto, numpy_helper
 from memmlp.common.errors import InputError
 from memmlp.deploy import lower_precision
 from memmlp.deploy.lower_precision import find_inner_layers, write_lower_precision
-from memmlp.deploy.onnx_stream import OnnxStream
+from memmlp.deploy.onnx_stream import OnnxStream, start_session
 from memmlp.deploy.opsets import GraphConstants
 from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation import modes as evaluation
@@ -68,15 +68,34 @@ def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, netwo
     assert 1e-7 < float(apart.mean()) < 1e-3
 
 
-def one_product(weight: np.ndarray, bias: np.ndarray) -> onnx.ModelProto:
-    """A graph of one layer: y = x @ weight.T + bias, x (1, inputs)."""
+def one_product(weight: np.ndarray, bias: np.ndarray, rows: int = 1) -> onnx.ModelProto:
+    """A graph of one layer: y = x @ weight.T + bias, x (rows, inputs)."""
     stored = {"model.inner.weight": weight, "model.inner.bias": bias}
     node = onnx.helper.make_node("Gemm", ["x", *stored], ["y"], "product", transB=1)
     value = onnx.helper.make_tensor_value_info
-    ends = [value(name, 1, [1, size]) for name, size in zip("yx", weight.shape, strict=True)]
+    ends = [value(name, 1, [rows, size]) for name, size in zip("yx", weight.shape, strict=True)]
     tensors = [numpy_helper.from_array(array, name) for name, array in stored.items()]
     graph = onnx.helper.make_graph([node], "one", ends[1:], ends[:1], tensors)
     return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=10)
+
+
+def test_the_newest_frame_has_sixteen_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    draw, source, path = np.random.default_rng(0), tmp_path / "step.onnx", tmp_path / "int8.onnx"
+    weight, inputs = draw.integers(-1, 2, (8, 16)).astype(np.float32), draw.normal(size=(50, 3, 16))
+    onnx.save(one_product(weight, np.zeros(8, np.float32), rows=3), source)
+    samples = SimpleNamespace(
+        get_next=iter([*({"x": one} for one in inputs.astype(np.float32)), None]).__next__
+    )
+    monkeypatch.setattr(lower_precision, "ActivationSamples", lambda *_: samples)
+    network = SimpleNamespace(float32_modules=(), int16_modules=("inner",))
+    write_lower_precision("int8", source, path, network, [])
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+    session = start_session(path.read_bytes())
+    apart = [
+        np.abs(session.run(None, {"x": one})[0] - one @ weight.T).max(1) for one in inputs.astype(np.float32)
+    ]
+    *older, newest = np.mean(apart, 0)
+    assert 0 < newest < min(older) / 50
 
 
 def test_layers_that_onnx_runtime_skips_are_an_error(
