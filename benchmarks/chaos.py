@@ -35,6 +35,7 @@ from memmlp.report.ui.server import Answers, RunsServer
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
+from memmlp.sweep.plan import Plan
 
 OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "loggers=none", "threads=1"]
 PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes
@@ -66,7 +67,7 @@ Launch = Callable[[], subprocess.Popen[bytes]]
     help="Kill workers of a sweep only then.",
 )
 @click.option(
-    "--stops", default=0, help="How often the page stops a run of the sweep meanwhile, and retries it."
+    "--stops", default=0, help="How often the page stops and retries a run meanwhile, and prioritises one."
 )
 @click.option("--seed", default=0, show_default=True, help="Seed of the choice of victims and pauses.")
 @click.argument("overrides", nargs=-1)
@@ -143,12 +144,27 @@ def stop_and_retry(outputs: Path, stops: int, dice: random.Random) -> Iterator[C
                     if stopped:
                         counts["seen"] += run.state(run.complete) == "stopped"
                         counts["left"] -= change(server, run, "retry")
+                    prioritize_last(server, outputs, counts)
             print(f"{stops - counts['late']} stops, of which {counts['seen']} were obeyed before their retry")
+            print(f"{counts['prioritized']} waiting runs prioritised, of which {counts['next']} were next")
 
         thread = threading.Thread(target=work)
         thread.start()
         yield lambda: counts["left"]
         thread.join()
+
+
+def prioritize_last(server: RunsServer, outputs: Path, counts: Counter[str]) -> None:
+    """Prioritise the last run that no worker has taken, and count whether a worker takes it next."""
+    tasks = [task for path in outputs.glob("sweeps/*/plan.json") for task in Plan.load(path).tasks]
+    runs = [Run.from_id(outputs, task.id) for task in tasks]
+    waiting = [run.folder for run in runs if not Lock(run.folder).list_claims()]
+    if len(waiting) > 1 and change(server, Run(waiting[-1]), "prioritize"):
+        end = time.monotonic() + PATIENCE
+        while not (taken := [one for one in waiting if Lock(one).list_claims()]) and time.monotonic() < end:
+            time.sleep(0.02)
+        counts["prioritized"] += bool(taken)
+        counts["next"] += waiting[-1] in taken
 
 
 def change(server: RunsServer, run: Run, action: str) -> bool:

@@ -103,12 +103,12 @@ Settings = _record(
 )  # fmt: skip
 Clip = _record(group=str | None, source=str | None, frames=int | None)  # other keys are branches
 NamedClip = _complete_record(Clip, name=str)
+ABOUT, Branches = {"name", *Clip.__annotations__}, dict[str, Errors]
 
 
 def _has_branches(clip: Mapping[str, Any]) -> bool:
     check_type(dict(clip), NamedClip)
-    errors = {key: value for key, value in clip.items() if key not in ("name", *Clip.__annotations__)}
-    check_type(errors, dict[str, Errors])
+    check_type({key: value for key, value in clip.items() if key not in ABOUT}, Branches)
     return True
 
 

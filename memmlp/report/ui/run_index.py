@@ -80,7 +80,8 @@ class RunIndex:
             facts = self.runs.get(name)
             if facts is None and time.monotonic() > end:
                 continue
-            is_quiet = facts and facts["quiet"] == changed and number % rounds != self._turn % rounds
+            its_turn = not self.unread and number % rounds == self._turn % rounds
+            is_quiet = facts and facts["quiet"] == changed and not its_turn
             found[name] = facts if is_quiet and facts else self._read_run(self.outputs / "runs" / name)
             found[name]["quiet"] = changed if found[name].pop("free", True) and changed < now - SETTLED else 0
         self.reads += len(self.runs.keys() - found.keys())
@@ -122,7 +123,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
     """Return the facts of a run for the page's list; `damage` lists unreadable files."""
     run = Run(folder)
     manifest, config, notes = run.manifest, read_config(run), read_notes(run)
-    listed, seconds = select_listed_values(config), manifest.get("seconds")
+    listed, seconds, damage = select_listed_values(config), manifest.get("seconds"), run.damage
     return {
         "id": run.id,
         "name": notes.name or get_run_name(manifest, listed),
@@ -143,14 +144,14 @@ def read_facts(folder: Path) -> dict[str, Any]:
         "batch": _read_batch(str(manifest.get("kind")), config),
         "since": (manifest.get("attempts") or [{}])[-1].get("started", ""),
         "after": sum(map((seconds or {}).get, STAGES_AFTER, (0.0, 0.0))) if run.done else None,
-        "marks": _list_marks(run),
+        "marks": {} if damage else _list_marks(run),
         "recent": _list_recent_entries(run),
         "config": listed,
         "metrics": _read_metrics(run, {key: config[key] for key in USE_GROUPS if key in config}),
         "failure": run.failure or "",
         "tags": list(notes.tags),
         "note": notes.note,
-        "damage": [line.removeprefix(f"{folder}/") for line in run.damage],
+        "damage": [line.removeprefix(f"{folder}/") for line in damage],
     }  # fmt: skip
 
 
@@ -162,7 +163,7 @@ def list_preparations(outputs: Path) -> list[dict[str, Any]]:
 
 def _list_marks(run: Run) -> dict[str, str]:
     """Return what a reader must know about a run's numbers: a text for "errors", and one for "latency"."""
-    if not is_trained(run) or run.damage:
+    if not is_trained(run):
         return {}
     marks = {"errors": warn_if_hardly_trained(count_training_frames(run))}
     record = select_deployed_measurements(run.deployment_as_configured.record)

@@ -43,3 +43,5 @@ def test_numbers_of_names_and_columns_are_rounded_to_what_differs():
     assert js("[...f.shortNames(['lr=0.12341', 'lr=0.12342']).values()]") == ["lr=0.12341", "lr=0.12342"]
     assert js("[0.123456, 2, 'a'].map(f.columnWords([0.123456, 0.2]))") == ["0.123", "2", "a"]
     assert js("[0.123456, 0.123499].map(f.columnWords([0.123456, 0.123499]))") == ["0.12346", "0.1235"]
+    small = "[0.00031623, 0.00031637, 0.001]"
+    assert js(f"{small}.map(f.columnWords({small}))") == ["0.0003162", "0.0003164", "0.001"]

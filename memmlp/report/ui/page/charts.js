@@ -32,7 +32,7 @@ export function figure(label, draw, legend = null) {
 const legendKey = (mark, text, colour) => h('span', { class: 'scale' }, h('b', { style: colour && `color:${colour}` }, mark), text);
 
 const base = (width, height, more) => ({
-  width, height, marginLeft: 56, marginRight: 16, marginTop: 22, marginBottom: 34,
+  width, height, marginLeft: 56, marginRight: 16, marginTop: 22, marginBottom: 38,
   style: { background: 'none', fontFamily: 'inherit', fontSize: '11.5px', overflow: 'visible' },
   ...more,
 });
@@ -40,8 +40,20 @@ const base = (width, height, more) => ({
 export const colourOf = groups => new Map([...groups].map((group, i) => [group, COLOURS[i % COLOURS.length]]));
 
 const plain = d3.format('~g'); // a scale's own format would write 4e+1
+// A logarithmic scale; over less than a decade, where D3 would label no tick, a power that looks the same.
+function logScale(values, width) {
+  const [least, most] = d3.extent(values);
+  return most < 10 * least ? { type: 'pow', exponent: 0.001, nice: false, ticks: 5, tickFormat: plain } : { type: 'log', ticks: Math.min(width / 150, 6), tickFormat: '~g' };
+}
+const shorten = (name, most) => (name.length > most ? `${name.slice(0, Math.ceil(most / 2) - 1)}…${name.slice(-Math.floor(most / 2))}` : name);
 const nameWidth = names => Math.max(...names.map(name => name.length)) * 6.6 + 18;
 const tip = (data, options) => Plot.tip(data, Plot.pointer({ fill: 'var(--card)', stroke: 'var(--line)', textPadding: 8, ...options }));
+
+// A plot whose chosen point is opened by a click.
+function openByClick(open, plot) {
+  plot.addEventListener('click', () => plot.value && open(plot.value));
+  return plot;
+}
 
 // Curves by group with the band of each group's runs.
 // series: [{ run, group, steps, values }]
@@ -56,7 +68,7 @@ export function curves(series, { label, log = false, smooth = 0, colours, axis =
   const lines = points.filter(point => single.has(point.group));
   const tips = [...wide, ...lines.map(point => ({ ...point, mean: point.value }))];
   const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.42, 220), 400), {
-    x: { label: axis, ticks: Math.min(width / 90, 8), tickFormat: axis === 'hours' ? plain : '~s' },
+    x: { label: axis, ticks: Math.min(width / 90, 8), tickFormat: axis === 'hours' ? plain : d3.format('~s') },
     y: { label, type: log ? 'log' : 'linear', grid: true, nice: true, ticks: 5, tickFormat: log ? undefined : plain },
     marks: [
       Plot.areaY(wide, { x: 'step', y1: 'low', y2: 'high', z: 'group', fill: point => colours.get(point.group), fillOpacity: 0.16 }),
@@ -71,7 +83,7 @@ export function curves(series, { label, log = false, smooth = 0, colours, axis =
     const mine = points.filter(point => point.group === group);
     return mine.length ? `${group} ends at ${number(mine.at(-1).value)}` : '';
   });
-  return figure(`${label} by ${axis}. ${last.filter(Boolean).join('; ')}.`, draw);
+  return figure(`${label} by ${axis}. ${last.filter(Boolean).join('; ')}.`, draw, wide.length ? legendKey('▒', 'range of the runs around their mean') : null);
 }
 
 // A run without NaN values, blurred over a radius of some points.
@@ -101,7 +113,6 @@ export function forest(rows, { label, smallest }) {
   const [single, several] = [known.filter(row => row.single), known.filter(row => !row.single)];
   const papers = rows.filter(row => row.paper !== null);
   const margin = width => Math.min(nameWidth(domain), 230, width * 0.38);
-  const shorten = (name, most) => (name.length > most ? `${name.slice(0, most - 1)}…` : name);
   const draw = width => Plot.plot(base(width, 72 + 34 * domain.length, {
     marginLeft: margin(width), marginBottom: 46,
     x: { label: `${label}, difference`, grid: true, zero: true, nice: true, inset: 14, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none', labelOffset: 42 },
@@ -118,10 +129,9 @@ export function forest(rows, { label, smallest }) {
     ],
   }));
   const sentence = known.map(row => `${row.variant}: ${row.words}`).join('; ');
-  const band = `smallest effect of interest, ±${number(smallest)}`;
   return figure(`${label}, differences from the control. ${sentence}`, draw, [
     several.some(row => row.significant) && legendKey('●', 'significant after Holm’s correction'), several.some(row => !row.significant) && legendKey('○', 'not significant', 'var(--accent)'),
-    single.length ? legendKey('×', 'one seed: undecided') : null, papers.length ? legendKey('◇', 'the paper’s difference', 'var(--ink)') : null, smallest ? legendKey('▒', band) : null]);
+    single.length ? legendKey('×', 'one seed: undecided') : null, papers.length ? legendKey('◇', 'the paper’s difference', 'var(--ink)') : null, smallest ? legendKey('▒', `smallest effect of interest, ±${number(smallest)}`) : null]);
 }
 
 // Errors with their intervals against a cost on a logarithmic axis, one curve for each series.
@@ -130,8 +140,7 @@ export function frontier(points, { x, y }) {
   const colour = point => colours.get(point.series);
   const words = point => `${point.variant}: ${number(point.mean)} at ${number(Number(point.cost.toPrecision(3)))}`;
   const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.6, 240), 400), {
-    x: { type: 'log', label: x, ticks: Math.min(width / 90, 6), tickFormat: '~g' },
-    y: { label: y, grid: true, nice: true, ticks: 5 },
+    inset: 10, x: { label: x, ...logScale(points.map(point => point.cost), width) }, y: { label: y, grid: true, nice: true, ticks: 5 },
     marks: [
       Plot.link(points.filter(point => point.low !== null), { x: 'cost', y1: 'low', y2: 'high', stroke: colour, strokeWidth: 1.5, strokeOpacity: 0.6 }),
       Plot.line(points, { x: 'cost', y: 'mean', z: 'series', stroke: colour, strokeWidth: 2 }),
@@ -142,40 +151,32 @@ export function frontier(points, { x, y }) {
   return figure(`${y} against ${x}. ${points.map(words).join('; ')}`, draw, [...colours].map(([series, one]) => legendKey('●', series, one)));
 }
 
-// Points { x, y, text, best } in two measures; a line joins the best ones. open(point): called by a click.
-export function scatter(points, { x, y, open, joined = true, log = false }) {
+// Points { x, y, text, best } in two measures; a line joins the best ones, which `mark` names. open(point): called by a click.
+export function scatter(points, { x, y, open, mark = null, joined = true, log = false }) {
   const isNumber = points.every(point => typeof point.x === 'number');
   const best = points.filter(point => point.best).sort((a, b) => a.x - b.x);
-  const draw = width => {
-    const plot = Plot.plot(base(width, 280, {
-      inset: 10, x: { label: x, grid: true, ...(isNumber ? { nice: true, ticks: Math.min(width / 90, 8), ...(log ? { type: 'log', tickFormat: '~g' } : { tickFormat: '~r' }) } : { type: 'point' }) }, y: { label: y, grid: true, nice: true, ticks: 6 },
-      marks: [
-        Plot.line(joined ? best : [], { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.6, curve: 'step-after' }),
-        Plot.dot(points, { x: 'x', y: 'y', r: 4.5, fill: point => (point.best ? 'var(--series1)' : 'var(--series0)'), fillOpacity: 0.85 }),
-        tip(points, { x: 'x', y: 'y', title: 'text' }),
-      ],
-    }));
-    plot.addEventListener('click', () => plot.value && open(plot.value));
-    return plot;
-  };
-  return figure(`${y} by ${x}; the best are ${best.map(point => number(point.y)).join(', ')}.`, draw);
+  const draw = width => openByClick(open, Plot.plot(base(width, 280, {
+    inset: 10, x: { label: x, grid: true, ...(isNumber ? { nice: true, ticks: Math.min(width / 90, 8), tickFormat: '~r', ...(log ? logScale(points.map(point => point.x), width) : {}) } : { type: 'point' }) }, y: { label: y, grid: true, nice: true, ticks: 6 },
+    marks: [
+      Plot.line(joined ? best : [], { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.6, curve: 'step-after' }),
+      Plot.dot(points, { x: 'x', y: 'y', r: 4.5, fill: point => (point.best ? 'var(--series1)' : 'var(--series0)'), fillOpacity: 0.85 }),
+      tip(points, { x: 'x', y: 'y', title: 'text' }),
+    ],
+  })));
+  return figure(`${y} by ${x}; the best are ${best.map(point => number(point.y)).join(', ')}.`, draw, mark && best.length ? legendKey('●', mark, 'var(--series1)') : null);
 }
 
 // A value over two keys, from scattered points { x, y, value, text }.
 export function contour(points, { x, y, label, log, open }) {
-  const scale = key => ({ label: key, nice: true, ticks: 6, type: log.includes(key) ? 'log' : 'linear', tickFormat: '~g' });
-  const draw = width => {
-    const plot = Plot.plot(base(width, 340, {
-      inset: 10, x: scale(x), y: scale(y), color: { scheme: 'viridis', reverse: true, legend: true, label, width: 220 },
-      marks: [
-        Plot.contour(points, { x: 'x', y: 'y', fill: 'value', interpolate: 'barycentric', blur: 2, thresholds: 12, fillOpacity: 0.7 }),
-        Plot.dot(points, { x: 'x', y: 'y', fill: 'value', stroke: 'var(--ink)', r: 4.5 }),
-        tip(points, { x: 'x', y: 'y', title: 'text' }),
-      ],
-    }));
-    plot.addEventListener('click', () => plot.value && open(plot.value));
-    return plot;
-  };
+  const scale = (key, at, size) => ({ label: key, nice: true, ticks: size / 90, tickFormat: '~g', ...(log.includes(key) ? logScale(points.map(point => point[at]), size) : {}) });
+  const draw = width => openByClick(open, Plot.plot(base(width, 340, {
+    inset: 10, x: scale(x, 'x', width), y: scale(y, 'y', 450), color: { scheme: 'viridis', reverse: true, legend: true, label, width: 220 },
+    marks: [
+      Plot.contour(points, { x: 'x', y: 'y', fill: 'value', interpolate: 'barycentric', blur: 2, thresholds: 12, fillOpacity: 0.7 }),
+      Plot.dot(points, { x: 'x', y: 'y', fill: 'value', stroke: 'var(--ink)', r: 4.5 }),
+      tip(points, { x: 'x', y: 'y', title: 'text' }),
+    ],
+  })));
   return figure(`${label} by ${x} and ${y}`, draw);
 }
 
@@ -188,24 +189,25 @@ export function parallel(rows, axes, { log = [], open }) {
     const at = numbers ? (log.includes(name) ? d3.scaleLog(ends, [0, 1]) : d3.scaleLinear(ends, [0, 1])) : d3.scalePoint(ends, [0, 1]);
     return [name, { at: value => at(numbers ? value : String(value)), ends: ends.length > 9 ? [ends[0], ends.at(-1)] : ends }];
   }));
-  const colour = d3.scaleSequential(d3.interpolateViridis).domain([1, 0]);
+  const colour = at => `color-mix(in oklab, var(--series0) ${Math.round(100 * at)}%, var(--series1))`; // seen on light and dark
   const points = rows.flatMap(row => axes.filter(name => (row.values[name] ?? null) !== null).map(name => ({ row, name, at: scales.get(name).at(row.values[name]), text: row.text })));
   const ticks = axes.flatMap(name => scales.get(name).ends.map(value => ({ name, at: scales.get(name).at(value), text: typeof value === 'number' ? number(value) : String(value).slice(0, 18) })));
   const last = new Map(points.filter(point => point.name === axes.at(-1)).map(point => [point.row, point.at]));
   const draw = width => {
-    const plot = Plot.plot(base(width, 320, {
-      marginLeft: 50, marginRight: 50, x: { domain: axes, type: 'point', label: null, tickSize: 0, tickFormat: name => name.split('.').slice(-2).join('.').slice(-Math.max(width / axes.length / 7, 6)) }, y: { axis: null, domain: [0, 1] },
+    const most = Math.max(Math.floor(width / 90), 2); // whose words fit
+    const shown = axes.length > most ? [...axes.slice(0, most - 1), axes.at(-1)] : axes;
+    const room = (width - 100) / (shown.length - 1) / 7.5; // characters
+    return openByClick(point => open(point.row), Plot.plot(base(width, 320, {
+      marginLeft: 50, marginRight: 50, x: { domain: shown, type: 'point', label: null, tickSize: 0, tickFormat: name => { const words = name.replace(/\.name$/, '').split('.').slice(-2); return shorten(words.join('.').length < room ? words.join('.') : words.at(-1), Math.floor(room)); } }, y: { axis: null, domain: [0, 1] }, color: { type: 'identity' },
       marks: [
-        Plot.ruleX(axes, { stroke: 'var(--line)' }),
-        Plot.line(points, { x: 'name', y: 'at', z: 'row', stroke: point => (last.has(point.row) ? colour(last.get(point.row)) : 'var(--faint)'), strokeOpacity: 0.75, strokeWidth: 1.4 }),
-        Plot.text(ticks, { x: 'name', y: 'at', text: 'text', dx: 4, textAnchor: 'start', stroke: 'var(--card)', strokeWidth: 4, fill: 'var(--ink)' }),
+        Plot.ruleX(shown, { stroke: 'var(--line)' }),
+        Plot.line(points.filter(point => shown.includes(point.name)), { x: 'name', y: 'at', z: 'row', stroke: point => (last.has(point.row) ? colour(last.get(point.row)) : 'var(--faint)'), strokeOpacity: 0.75, strokeWidth: 1.4 }),
+        Plot.text(ticks.filter(tick => shown.includes(tick.name)), { x: 'name', y: 'at', text: 'text', dx: 4, textAnchor: 'start', stroke: 'var(--card)', strokeWidth: 4, fill: 'var(--ink)' }),
         tip(points, { x: 'name', y: 'at', title: 'text' }),
       ],
-    }));
-    plot.addEventListener('click', () => plot.value && open(plot.value.row));
-    return plot;
+    })));
   };
-  return figure(`${rows.length} lines over ${axes.join(', ')}; coloured by ${axes.at(-1)}`, draw);
+  return figure(`${rows.length} lines over ${axes.join(', ')}; coloured by ${axes.at(-1)}`, draw, legendKey('', `${axes.at(-1)}: orange is low, blue is high`));
 }
 
 // When each trial ran: { number, began, ended, kind, text }, in seconds.
@@ -214,14 +216,14 @@ export function spans(rows, { label }) {
   const [unit, size] = Math.max(...rows.map(row => row.ended)) - start < 7200 ? ['minutes', 60] : ['hours', 3600];
   const at = time => (time - start) / size;
   const colour = row => ({ done: 'var(--good)', failed: 'var(--bad)', running: 'var(--series0)' })[row.kind] ?? 'var(--faint)';
-  const draw = width => Plot.plot(base(width, Math.min(60 + 9 * rows.length, 480), {
+  const draw = width => Plot.plot(base(width, Math.min(Math.max(60 + 9 * rows.length, 170), 480), {
     x: { label: unit, grid: true, ticks: Math.min(width / 90, 8) }, y: { label: 'trial', reverse: true, nice: true, ticks: 6, tickFormat: '~r' },
     marks: [
       Plot.link(rows, { x1: row => at(row.began), x2: row => at(row.ended), y1: 'number', y2: 'number', stroke: colour, strokeWidth: 4, strokeLinecap: 'round' }),
       tip(rows, { x: row => at(row.began), y: 'number', title: 'text' }),
     ],
   }));
-  return figure(`${label}: ${rows.map(row => row.text).join('; ')}`, draw);
+  return figure(`${label}: ${rows.map(row => row.text).join('; ')}`, draw, [...new Set(rows.map(row => row.kind))].map(kind => legendKey('●', kind, colour({ kind }))));
 }
 
 // Errors over time; a click goes to a moment. The style property --now, from 0 to 1, places a line.

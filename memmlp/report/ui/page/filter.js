@@ -26,7 +26,7 @@ function test(word) {
 function reader(key) {
   if (key === 'tag' || key === 'tags') return run => run.tags;
   if (PLACES.includes(key)) return run => run.places.map(place => place[key]).filter(value => value !== undefined);
-  if (FACTS.includes(key)) return run => [run[key]];
+  if (FACTS.includes(key)) return run => (key === 'data' ? [run.data, run.data_name] : [run[key]]);
   const near = name => name === key || name === `${key}.name`;
   const far = name => name.endsWith(`.${key}`) || name.replace('.rotation.', '.') === key;
   for (const fits of [near, far]) {

@@ -46,14 +46,14 @@ export function largestFirst(one, other) {
 export function word(value) {
   if (value === null || value === undefined) return DASH;
   if (typeof value === 'number') return value.toString().length > 8 ? number(value) : String(value).replace('-', MINUS);
-  return Array.isArray(value) ? value.map(word).join(', ') : String(value);
+  return Array.isArray(value) ? value.map(word).join(', ') || '[]' : String(value);
 }
 
 // A function that writes the values of a column with as few digits as keep different numbers apart, at least three.
 export function columnWords(values) {
   const numbers = [...new Set(values.filter(value => typeof value === 'number' && Number.isFinite(value)))];
   const digits = [3, 4, 5, 6, 8].find(count => new Set(numbers.map(value => value.toPrecision(count))).size === numbers.length) ?? 16;
-  return value => (typeof value === 'number' && !Number.isInteger(value) ? word(Number(value.toPrecision(digits))) : word(value));
+  return value => (typeof value === 'number' && !Number.isInteger(value) ? String(Number(value.toPrecision(digits))).replaceAll('-', MINUS) : word(value));
 }
 
 // Names with their long numbers rounded to three digits, or to as many as keep different names apart.

@@ -38,7 +38,7 @@ export function now() {
   const byTime = (a, b) => (b.since || b.started).localeCompare(a.since || a.started);
   const failed = list.filter(run => BROKEN.includes(run.status)).sort(byTime);
   const running = list.filter(run => ACTIVE.includes(run.status)).sort(byTime);
-  const failure = run => h('p', { class: 'warning' }, link(address('run', run.id), h('b', {}, nameOf(run))), ` ${run.status} ${ago(run.since || run.started)}: `, run.failure || run.damage.join('; ') || 'no reason is recorded');
+  const failure = run => h('p', { class: 'warning' }, link(address('run', run.id), h('b', {}, nameOf(run))), ` ${run.status}${run.since || run.started ? ` ${ago(run.since || run.started)}` : ''}: `, run.failure || run.damage.join('; ') || 'no reason is recorded');
   const work = run => h('li', {}, link(address('run', run.id), nameOf(run)), ' ', status(run), run.status === 'training' && run.steps ? h('small', {}, `training, step ${run.recent.at(-1)?.[0] ?? 0} of ${run.steps}`) : null);
   const more = (all, shown, word) => (all.length > shown ? h('p', {}, link(address('runs', '', { filter: `status=${word}` }), `${all.length - shown} more`)) : null);
   const data = about.preparing.map(one => h('li', {}, `Preparing the data ${one.name}`, ' ', h('small', {}, `${bytes(one.bytes)} written; training follows`)));

@@ -171,7 +171,7 @@ function files(run) {
   const sum = run.files.reduce((total, file) => total + file.bytes, 0);
   const manifest = Object.entries(run.manifest).filter(([key]) => !/^(attempts|sources|seconds|prerequisite_runs)/.test(key)).map(([key, value]) => [key, word(value)]);
   return section('Files and origin',
-    h('details', {}, h('summary', {}, `${run.files.length} files, ${bytes(sum)}`), table(null, run.files.map(file => [name(file), bytes(file.bytes), run.changed.includes(file.name) ? 'changed' : '']))),
+    h('details', {}, h('summary', {}, `${run.files.length} file${run.files.length === 1 ? '' : 's'}, ${bytes(sum)}`), table(null, run.files.map(file => [name(file), bytes(file.bytes), run.changed.includes(file.name) ? 'changed' : '']))),
     h('details', {}, h('summary', {}, 'Environment: code, packages, machine'), pairs(manifest)),
     run.patch ? h('details', {}, h('summary', {}, 'Patch of the code since its commit'), h('pre', { class: 'log' }, run.patch)) : null);
 }

@@ -135,12 +135,12 @@ export async function page(name, route) {
     if (key === ui.plotted) return plot;
     ui.plotted = key;
     return replace(plot, section('Scatter', h('div', { class: 'tools' }, select('Horizontal', [...about.keys, ...about.metrics].map(one => [one, one]), x, value => set({ x: value }))),
-      points.length ? scatter(points, { x, y: metricText(y), joined: false, open: point => { location.hash = address('run', point.run.id); } }) : h('p', { class: 'faint' }, 'No run has both.')));
+      points.length ? scatter(points, { x, y: metricText(y), mark: 'baseline', joined: false, open: point => { location.hash = address('run', point.run.id); } }) : h('p', { class: 'faint' }, 'No run has both.')));
   }
 
   function axesOf(query) {
     const rows = query.get('axes') ? ui.list.slice(0, 500).map(run => ({ id: run.id, text: nameOf(run), values: { ...run.config, ...run.metrics } })) : [];
-    const axes = [...ui.columns].sort((a, b) => about.metrics.includes(a) - about.metrics.includes(b)).slice(0, NARROW.matches ? 4 : 9);
+    const axes = [...ui.columns].sort((a, b) => about.metrics.includes(a) - about.metrics.includes(b)).slice(0, 9);
     const key = JSON.stringify([axes, rows.map(row => [row.id, axes.map(name => row.values[name])])]);
     if (key === ui.axes) return;
     ui.axes = key;
@@ -212,7 +212,7 @@ export async function page(name, route) {
     };
     return h('tr', {},
       h('td', { class: 'pick' }, box),
-      h('th', { scope: 'row', 'data-csv': `${run.name} ${run.id}` }, link(address('run', run.id), h('span', { class: 'name', title: run.name }, nameOf(run))), h('span', { class: 'id' }, run.id.slice(0, 8)), tags(run), run.note && h('span', { class: 'note', title: run.note }, run.note)),
+      h('th', { scope: 'row', 'data-csv': `${run.name} ${run.id}` }, link(address('run', run.id), h('span', { class: 'name', title: run.name }, nameOf(run))), h('span', { class: 'id' }, run.id.slice(0, 8)), run.tags.length || run.note ? h('div', { class: 'tags' }, tags(run), run.note && h('span', { class: 'note', title: run.note }, run.note)) : null),
       h('td', { 'data-csv': run.status }, status(run)), ui.columns.map(cell),
       h('td', { class: 'n faint', title: date(run.started), 'data-csv': run.started }, ago(run.started)), h('td', { class: 'n faint', 'data-csv': run.seconds ?? '' }, duration(run.seconds)));
   }

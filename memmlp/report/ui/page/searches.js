@@ -2,6 +2,7 @@
 
 import { cards, h, replace, link, section, empty, select, table } from './dom.js';
 import { address, ask, place, remember, runs } from './store.js';
+import { command } from './actions.js';
 import { contour, parallel, scatter, spans } from './charts.js';
 import { columnWords, duration, number, shortKeys, word } from './format.js';
 import { state } from './state.js';
@@ -20,7 +21,7 @@ export async function page() {
     const { searches } = await ask('searches');
     const summary = search => (search.error ? h('span', { class: 'state failed' }, search.error) : h('span', {}, search.best?.length ? [h('b', { class: 'n' }, values(search.best[0])), ' best · '] : null, h('small', { class: 'faint' }, counts(search))));
     replace(element, cards('Searches', searches.map(search => [address('search', search.name), search.title, [search.name, search.objectives?.join(', ')].filter(Boolean).join(' · '), summary(search)]),
-      empty('There are no searches yet.', h('p', {}, 'A search over the loss weights, or any keys:'), h('pre', {}, 'memmlp tune data=mocap data.root=FOLDER search.n_trials=30'))));
+      empty('There are no searches yet.', h('p', {}, 'A search over the loss weights, or any keys:'), command('memmlp tune data=mocap data.root=FOLDER search.n_trials=30'))));
   }
   await update();
   return { title: 'Searches', element, update };
@@ -58,10 +59,10 @@ function body(search, update) {
   return [
     h('div', { class: 'sum' }, h('p', {}, counts(search)), h('p', { class: 'best' }, best.length === 1 ? 'Best: ' : 'On the Pareto front: ', best.slice(0, 8).map((trial, i) => [i ? ', ' : '', runLink(trial), ' ', h('b', { class: 'n' }, values(trial))])), search.ends.map(line => h('p', { class: 'faint' }, line))),
     search.objectives.length > 1 ? h('div', { class: 'tools' }, select('Objective', search.objectives.map(one => [one, one]), objective, value => { remember({ objective: value }); update(); })) : null,
-    search.objectives.length === 2 ? section('Pareto front', scatter(points, { x: search.objectives[0], y: search.objectives[1], open })) : null,
-    h('div', { class: 'pair' }, section('History', scatter(history, { x: 'trial', y: objective, open })), importance && section('Importance', importance)),
+    search.objectives.length === 2 ? section('Pareto front', scatter(points, { x: search.objectives[0], y: search.objectives[1], open, mark: 'on the front' })) : null,
+    h('div', { class: 'pair' }, section('History', scatter(history, { x: 'trial', y: objective, open, mark: 'best so far' })), importance && section('Importance', importance)),
     section('Slices', h('p', { class: 'faint' }, `${objective} by the value of each key.`), h('div', { class: 'charts' }, search.keys.map(key => h('div', { class: 'panel-chart' }, scatter(
-      history.filter(point => point.params[key] !== undefined).map(point => ({ ...point, x: typeof point.params[key] === 'number' ? point.params[key] : word(point.params[key]), best: search.front.includes(point.number) })), { x: short.get(key), y: objective, open, joined: false, log: search.log.includes(key) }))))),
+      history.filter(point => point.params[key] !== undefined).map(point => ({ ...point, x: typeof point.params[key] === 'number' ? point.params[key] : word(point.params[key]), best: search.front.includes(point.number) })), { x: short.get(key), y: objective, open, mark: best.length === 1 ? 'best trial' : 'on the front', joined: false, log: search.log.includes(key) }))))),
     contours(search, history, objective, open, update),
     search.keys.length > 1 ? section('Parallel axes', parallel(history.map(point => ({ ...point, values: { ...point.params, [objective]: point.y } })), [...search.keys.slice(0, 8), objective], { log: search.log, open })) : null,
     timeline(search),

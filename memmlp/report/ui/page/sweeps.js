@@ -21,7 +21,7 @@ export async function page() {
   return { title: 'Sweeps', element, update };
 }
 
-const noSweeps = () => empty('There are no sweeps yet.', h('p', {}, 'Start a sweep of the paper, or a custom one:'), h('pre', {}, 'memmlp sweep 14 data=mocap data.root=FOLDER\nmemmlp sweep mine.yaml --workers 2'));
+const noSweeps = () => empty('There are no sweeps yet.', h('p', {}, 'Start a sweep of the paper, or a custom one:'), command('memmlp sweep 14 data=mocap data.root=FOLDER'), command('memmlp sweep mine.yaml --workers 2'));
 
 function progress(sweep) {
   const words = counts => ORDER.filter(name => counts[name]).map(name => `${counts[name]} ${STATE_WORDS[name] ?? name}`).join(', ');
@@ -100,7 +100,7 @@ function board(sweep) {
   const before = sweep.prerequisites.map(task => h('li', {}, runs.has(task.id) ? link(address('run', task.id), task.name) : task.name, ' ', state(task.state)));
   return section('Runs', h('p', { class: 'faint' }, `${metricText(sweep.metric)}, stream mode${sweep.branch ? `, ${sweep.branch} branch` : ''}.`),
     table(['variant', ...seeds.map(seed => `seed ${seed}`)], variants.map(variant => [variant, ...seeds.map(seed => draw(at(variant, seed)))])),
-    before.length ? h('details', {}, h('summary', {}, `${before.length} prerequisite runs`), h('ul', { class: 'remarks' }, before)) : null, failures);
+    before.length ? h('details', {}, h('summary', {}, `${before.length} prerequisite run${before.length > 1 ? 's' : ''}`), h('ul', { class: 'remarks' }, before)) : null, failures);
 }
 
 // A difference with its interval, verdict and the paper's difference, in words.
