@@ -18,7 +18,7 @@ from memmlp.evaluation import modes
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
+from memmlp.networks.memory import FeatureMemory, GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, MemoryWithoutCodes
 from memmlp.networks.predictor import RotationOnlySettings, TwoBranchMemorySettings, TwoBranchSettings
@@ -114,7 +114,7 @@ def test_a_network_without_a_streaming_graph_is_refused():
         make_streaming_graph(tiny.model(CodeMemory, history="latest"))
     model = tiny.baseline("avatar_poser")
     model.__class__ = Different
-    for one in (model, tiny.refined(model)):
+    for one in (model, tiny.refined(model), tiny.model(FeatureMemory, layers=())):
         assert not has_streaming_graph(one)
     with pytest.raises(InputError, match=r"export\.graph=streaming"):
         make_streaming_graph(model)

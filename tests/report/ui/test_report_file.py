@@ -1,8 +1,7 @@
 """What `memmlp report` puts into the page's file."""
 
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 from memmlp.report.ui.report_file import _select_sweeps, _shorten_run_page, encode_query, round_numbers
 
@@ -19,8 +18,7 @@ def test_clips_without_a_number_are_the_worst():
 
 
 def test_names_choose_sweeps():
-    known = {"table05-a": "a", "table05-b": "b", "mine": "m"}
-    answers: Any = SimpleNamespace(outputs=Path(), sweeps=SimpleNamespace(known=known))
+    answers = MagicMock(**{"sweeps.known": {"table05-a": "a", "table05-b": "b", "mine": "m"}})
     for names, shown in (([], "abm"), (["5"], "ab"), (["x/mine.yaml", "table05-b"], "mb")):
         assert "".join(_select_sweeps(answers, names).values()) == shown
 
