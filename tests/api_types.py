@@ -1,7 +1,5 @@
-"""The types of the API in a user's script, which `make check` lets mypy --strict read.
-
-Each wrong line below has an error that mypy must find: an unused `type: ignore` is an error itself.
-"""
+"""The types of the API in a user's script, which `make check` lets mypy --strict read. Each wrong line below
+has an error that mypy must find: an unused `type: ignore` is an error itself."""
 
 from pathlib import Path
 from typing import assert_type

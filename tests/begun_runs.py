@@ -9,9 +9,7 @@ from memmlp.runs.run import Run
 CONFIG = {"seed": 0, "model": {"width": 16, "layers": [2, 4]}, "optim": {"lr": 1e-3, "log_every": 5}}
 
 
-def identity(
-    config: dict = CONFIG, kind: str = "memmlp", data: str = "d", prerequisite: Identity | None = None
-) -> str:
+def identity(config: dict = CONFIG, kind: str = "memmlp", data: str = "d", prerequisite=None) -> str:
     return Identity(kind, config, data, prerequisite).id
 
 

@@ -36,10 +36,8 @@ CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 
 
 class Chromium:
-    """A browser that reaches this machine only, and lives as long as the test process.
-
-    It lacks the mark of processes that end with a test file.
-    """
+    """A browser that reaches this machine only, and lives as long as the test process. It lacks the mark of
+    processes that end with a test file."""
 
     def __init__(self) -> None:
         if CHROMIUM is None:

@@ -29,10 +29,8 @@ BRIEF = ["profile=tiny", *SMALL, *FEW]  # half as much motion
 
 
 def run(folder: Path, *arguments: str, code: int = 0, picture: bool = False) -> str:
-    """The output of a command line in a folder, on both streams; it must exit with the code.
-
-    It runs in this process, which has imported torch and the exporter: half the time of a run of six steps.
-    """
+    """The output of a command line in a folder, on both streams; it must exit with the code. It runs in this
+    process, which has imported torch and the exporter: half the time of a run of six steps."""
     said, threads = io.StringIO(), torch.get_num_threads()
     with contextlib.chdir(folder), contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         left = exit_code(arguments, picture)
@@ -42,11 +40,9 @@ def run(folder: Path, *arguments: str, code: int = 0, picture: bool = False) -> 
 
 
 def exit_code(arguments: Sequence[str], picture: bool = False) -> int:
-    """The exit code of a command line in this process and folder.
-
-    Latency is compared with a small yardstick, and without `picture` the pictures of runs are of one pixel:
-    together they are half the time of a tiny run.
-    """
+    """The exit code of a command line in this process and folder. Latency is compared with a small yardstick,
+    and without `picture` the pictures of runs are of one pixel: together they are half the time of a tiny
+    run."""
     with contextlib.ExitStack() as stack:
         shape = (*latency.YARDSTICK_SHAPE[:2], 1)
         stack.enter_context(mock.patch.object(latency, "YARDSTICK_SHAPE", shape))

@@ -114,10 +114,8 @@ def shared(factory: pytest.TempPathFactory, name: str) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one finished run, int8 included, and its output; made once for all processes.
-
-    Tests only read it, or copy it (`home`).
-    """
+    """A folder with one finished run, int8 included, and its output; made once for all processes. Tests only
+    read it, or copy it (`home`)."""
     folder = shared(tmp_path_factory, "tiny")
     said = folder / "out.txt"
     with FileLock(f"{folder}.lock"), pytest.MonkeyPatch.context() as monkeypatch:

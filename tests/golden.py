@@ -1,8 +1,6 @@
-"""The numbers that every component makes of fixed inputs, for tests/test_golden.py.
-
-`make golden` writes that file. It refuses where a component's numbers changed and its version
-did not: raise that first, in its declaration or in memmlp/runs/identity.py, in the same commit.
-"""
+"""The numbers that every component makes of fixed inputs, for tests/test_golden.py. `make golden` writes that
+file. It refuses where a component's numbers changed and its version did not: raise that first, in its
+declaration or in memmlp/runs/identity.py, in the same commit."""
 
 import json
 import sys
@@ -382,19 +380,15 @@ def stored() -> dict[str, dict[str, Any]]:
 
 
 def record() -> None:
-    """Write golden.json; exits with 1 if numbers changed or disappeared under an unchanged version.
-
-    New numbers of an unchanged version are added.
-    """
+    """Write golden.json; exits with 1 if numbers changed or disappeared under an unchanged version. New
+    numbers of an unchanged version are added."""
     before, now = stored(), {case: numbers(case) for case in CASES}
     same = [case for case in CASES if before.get(case, {}).get("recipe") == find_version(case)]
     known = {case: before[case]["numbers"] for case in same}
     wrong = [case for case, old in known.items() if old.keys() & changed(now[case], old, tolerance(case))]
     if wrong:
         sys.exit(f"raise the version of {', '.join(wrong)}: their numbers changed")
-    kept = {
-        case: {"recipe": find_version(case), "numbers": now[case] | known.get(case, {})} for case in CASES
-    }
+    kept = {one: {"recipe": find_version(one), "numbers": now[one] | known.get(one, {})} for one in CASES}
     PATH.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
 
 

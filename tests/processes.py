@@ -24,10 +24,8 @@ PRELOADED = [
 
 
 def mark() -> None:
-    """Mark the environment of all processes that this one starts, by which `end_all` finds them.
-
-    The marks of xdist's workers begin with that of their controller, which therefore finds the workers' too.
-    """
+    """Mark the environment of all processes that this one starts, by which `end_all` finds them. The marks of
+    xdist's workers begin with that of their controller, which therefore finds the workers' too."""
     os.environ[MARK] = f"{os.environ.get(MARK, '')}/{os.getpid()}"
 
 
@@ -68,10 +66,8 @@ def finished(line: Sequence[str], **options: Any) -> subprocess.CompletedProcess
 
 
 class Forked(ForkServerProcess):
-    """A process that calls a function, with the interface of `subprocess.Popen`.
-
-    It is forked off a server that has imported torch and memmlp once, which takes seconds of CPU time.
-    """
+    """A process that calls a function, with the interface of `subprocess.Popen`. It is forked off a server
+    that has imported torch and memmlp once, which takes seconds of CPU time."""
 
     returncode = ForkServerProcess.exitcode
 
@@ -88,9 +84,7 @@ class Forked(ForkServerProcess):
         return self.exitcode
 
 
-def _call(
-    said: str, environment: dict[str, str], work: Callable[..., object], arguments: Sequence[Any]
-) -> None:
+def _call(said: str, environment: dict[str, str], work: Callable, arguments: Sequence[Any]) -> None:
     os.environ.clear()
     os.environ.update(environment)
     file = os.open(said, os.O_WRONLY | os.O_APPEND)

@@ -126,10 +126,8 @@ def check_script(script: Path, words: list[str]) -> None:
 
 
 def check_memmlp(words: list[str], whole: bool) -> None:
-    """Parse the arguments of `memmlp`, and compose all configs that they name.
-
-    Files and folders that the line names in place of a reader's are created in the current folder.
-    """
+    """Parse the arguments of `memmlp`, and compose all configs that they name. Files and folders that the
+    line names in place of a reader's are created in the current folder."""
     create_placeholders(words)
     command, name = commands, ""
     while isinstance(command, click.Group) and words and not words[0].startswith("-"):

@@ -48,9 +48,7 @@ ROLLOUTS = {
 
 def make_task(model: MotionModel, loss: Loss, rollout: Rollout, optim: Optim, seed: int = 0) -> MotionTask:
     rollout.begin(model)
-    return MotionTask(
-        model, loss, rollout, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0}
-    )
+    return MotionTask(model, loss, rollout, tiny.frames(), optim, seed, validate=lambda _: {"answer": 42.0})
 
 
 def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0, **changes) -> MotionTask:

@@ -1,7 +1,5 @@
 """A receiver of the VMC protocol (protocol.vmc.info/english) in Unity's axes: left-handed, Y up, +Z forward.
-
-It reads OSC as docs/examples/vmc/receive.py does, which is independent of python-osc.
-"""
+It reads OSC as docs/examples/vmc/receive.py does, which is independent of python-osc."""
 
 import runpy
 import socket

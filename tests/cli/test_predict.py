@@ -75,9 +75,7 @@ def test_foreign_clips_need_the_run_alone(home: Path, run: str, tmp_path: Path):
     said = command_line.run(tmp_path, "predict", run, "clips", "--out", "out", "--format", "gltf")
     assert "skipped bad.npz: " in said
     made = {file.relative_to(tmp_path / "out").with_suffix("") for file in (tmp_path / "out").rglob("*.glb")}
-    clips = {
-        file.relative_to(tmp_path / "clips").with_suffix("") for file in (tmp_path / "clips").rglob("*.npz")
-    }
+    clips = {f.relative_to(tmp_path / "clips").with_suffix("") for f in (tmp_path / "clips").rglob("*.npz")}
     assert made == clips - {Path("bad")} != set()
     assert not (tmp_path / "outputs" / "cache").exists()
     write_json(tmp_path / "clips" / "import.json", describe_body("model.npz", np.ones((22, 3))))

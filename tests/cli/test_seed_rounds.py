@@ -28,9 +28,7 @@ class Runs:
         self.patience = 1000  # how many runs are made before Ctrl-C
 
     def planned(self, sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-        cells = [
-            (variant.label, seed) for variant in sweep.list_runnable() for seed in sweep.get_seeds(variant)
-        ]
+        cells = [(one.label, seed) for one in sweep.list_runnable() for seed in sweep.get_seeds(one)]
         entries = [Entry(label, seed, self._id(label, seed)) for label, seed in cells]
         tasks = [RunTask(entry.id, "memmlp", {"optim": {"steps": 1}, "device": "cpu"}) for entry in entries]
         return Plan(sweep.name, self.outputs, tuple(entries), tuple(tasks))
@@ -89,9 +87,7 @@ def test_seeds_go_where_verdicts_are_open(memmlp: Memmlp, runs: Runs):
     ran = memmlp(*SWEEP)
     assert ran.code == 0, ran.err
     assert analysed() == ANALYSED
-    expected = [("worse", seed) for seed in range(3)] + [
-        (label, s) for label in ("full", "same") for s in range(8)
-    ]
+    expected = [("worse", s) for s in range(3)] + [(one, s) for one in ("full", "same") for s in range(8)]
     assert sorted(runs.made) == sorted(expected)
     for seeds, level, decided in ((3, "0.33", 2), (5, "0.67", 2), (8, "1.3", 4)):
         assert f"analysis at {seeds} seeds ({level} %): {decided} of 4 comparisons decided" in ran.out
@@ -117,9 +113,7 @@ def test_seeds_go_where_verdicts_are_open(memmlp: Memmlp, runs: Runs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "patience", [0, 11, *(pytest.param(runs, marks=pytest.mark.long) for runs in (9, 18))]
-)
+@pytest.mark.parametrize("patience", [0, 11, *(pytest.param(n, marks=pytest.mark.long) for n in (9, 18))])
 def test_interrupted_anywhere_it_ends_the_same(memmlp: Memmlp, runs: Runs, patience: int):
     runs.patience = patience
     assert memmlp(*SWEEP).code == 130

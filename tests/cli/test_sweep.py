@@ -66,9 +66,7 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     assert "3 done, 1 failed" in said
     assert said.startswith(f"overrides: {' '.join(TINY)}")
     assert "has changed since" not in said
-    older = next(
-        run for run in list_runs(home / "outputs") if run.config.get("memory", {}).get("name") == "none"
-    )
+    older = next(r for r in list_runs(home / "outputs") if r.config.get("memory", {}).get("name") == "none")
     sources = older.manifest["sources"]
     older.write_manifest({"sources": sources | {"training/loop.py": "0" * 12}})
     assert re.search(r"training/loop.py has changed since.*: 'none'\n", command(home, "--status"))
@@ -85,15 +83,13 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
 
 def test_variants_that_are_named_are_run_alone(home: Path):
     before = stamps(home)
-    assert "1 of 2 runs to do" in command(
-        home, "seed=0,1", "--variant", "none", "--dry-run", "--workers", "1"
-    )
+    said = command(home, "seed=0,1", "--variant", "none", "--dry-run", "--workers", "1")
+    assert "1 of 2 runs to do" in said
     said = command(home, "--status", "--variant", "none")
     assert "1 done" in said
     assert "wild" not in said
-    said = command(
-        home, "--variant", "none", "--variant", "full"
-    )  # the failure of another variant does not count
+    # The failure of another variant does not count.
+    said = command(home, "--variant", "none", "--variant", "full")
     assert "3 of 4 runs done" in said
     assert "repeat failed runs with --retry" in command(home, "--variant", "wild", code=1)
     assert stamps(home) == before

@@ -31,10 +31,8 @@ def environment(file: Path) -> dict[str, str]:
 
 @pytest.mark.long
 def test_two_processes_make_the_run_of_one(tmp_path: Path):
-    """Its VQ-VAE and its network; the first process alone writes and evaluates (and would deploy).
-
-    The processes have torchrun's environments, and are forked, since each would import torch for seconds.
-    """
+    """Its VQ-VAE and its network; the first process alone writes and evaluates (and would deploy). The
+    processes have torchrun's environments, and are forked, since each would import torch for seconds."""
     ranks = [tmp_path / f"rank{rank}" for rank in range(2)]
     said = [tmp_path / f"said{rank}" for rank in range(2)]
     # Of less motion, steps depend on the order of sums: gradients of what never moves are of rounding alone.

@@ -44,10 +44,8 @@ def precise(name: str) -> TrainingTask:
 
 
 def together(folder: Path, *names: str) -> None:
-    """Train tasks in this process, one of several, each in FOLDER/TASK from its checkpoint.
-
-    In a task named die=TASK the second process is killed on the way.
-    """
+    """Train tasks in this process, one of several, each in FOLDER/TASK from its checkpoint. In a task named
+    die=TASK the second process is killed on the way."""
     distributed.connect("cpu")
     for word in names:
         name = word.removeprefix("die=")

@@ -98,13 +98,9 @@ def test_the_newest_frame_has_sixteen_bits(tmp_path: Path, monkeypatch: pytest.M
     assert 0 < newest < min(older) / 50
 
 
-def test_layers_that_onnx_runtime_skips_are_an_error(
-    step_files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_layers_that_onnx_runtime_skips_are_an_error(step_files, tmp_path: Path, monkeypatch):
     """As versions did with some layers of transformers."""
-    monkeypatch.setattr(
-        lower_precision, "quantize_static", lambda source, path, *_, **__: shutil.copy(source, path)
-    )
+    monkeypatch.setattr(lower_precision, "quantize_static", lambda one, to, *_, **__: shutil.copy(one, to))
     stream = make_streaming_graph(exported.NETWORKS["mem_mlp"]())
     with pytest.raises(RuntimeError, match="layers in float32"):
         write_lower_precision("int8", step_files("mem_mlp"), tmp_path / "int8.onnx", stream, CLIPS)

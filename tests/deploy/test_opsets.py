@@ -1,6 +1,5 @@
 """A step in every opset: checked, the same numbers, and no operator whose work depends on the data."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import exported
@@ -31,9 +30,7 @@ def model(*nodes: onnx.NodeProto, **constants: np.ndarray) -> ModelProto:
 @pytest.mark.parametrize(
     "network", ["mem_mlp", "lstm", "hmd_poser", pytest.param("bodiffusion", marks=pytest.mark.long)]
 )
-def test_a_step_computes_the_same_in_every_opset(
-    step_files: Callable[[str], Path], tmp_path: Path, network: str
-):
+def test_a_step_computes_the_same_in_every_opset(step_files, tmp_path: Path, network: str):
     source, path = step_files(network), tmp_path / "step.onnx"
     native = onnx.load(source)
     assert exported.data_dependent(native.graph) == set()

@@ -40,9 +40,7 @@ def trackers(space: str) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def played(
-    tmp_path_factory: pytest.TempPathFactory, step_files: Callable[..., Path]
-) -> Callable[[str], Played]:
+def played(tmp_path_factory: pytest.TempPathFactory, step_files) -> Callable[[str], Played]:
     """A clip of trackers through a tiny network, by the name of the space."""
     folder = shared(tmp_path_factory, "engines")
 

@@ -1,8 +1,6 @@
 """The example for Unity, compiled by Mono against stand-ins of Unity's types, with the network run from here.
-
 The scripts compile in C# 7, and states, axes, frames, lost trackers, calibration and the rig are right, as
-far as the stand-ins (tests/examples/unity) are. Unity itself is not tested.
-"""
+far as the stand-ins (tests/examples/unity) are. Unity itself is not tested."""
 
 import shutil
 import subprocess
@@ -108,9 +106,7 @@ def stream(step_files: Callable[[str], Path]) -> Stream:
 
 
 @pytest.mark.parametrize("quaternions", [False, True])
-def test_bones_are_where_the_stream_has_the_joints(
-    quaternions: bool, play: Player, played: Callable[[str], Played]
-):
+def test_bones_are_where_the_stream_has_the_joints(quaternions: bool, play: Player, played):
     play.quaternions = quaternions
     bones = play(rows(trackers("unity")))
     assert wearer.fastest(bones) > 10

@@ -64,9 +64,7 @@ def fork_controllers(folder: Path, monkeypatch: pytest.MonkeyPatch, *workers: st
 
 @pytest.mark.long
 @pytest.mark.parametrize("during", ["anything", "checkpoints", "evaluation", "export"])
-def test_a_sweep_under_kills_ends_as_an_undisturbed_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, during: str
-):
+def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch, during: str):
     fork_controllers(tmp_path, monkeypatch, "executor=debug")
     words, controllers = [*SMALL, "evaluation.modes=[stream]", "optim.checkpoint_every=5"], 1
     if during == "anything":

@@ -178,10 +178,8 @@ def test_read_only_outputs_are_one_line(memmlp: Memmlp, tmp_path: Path, monkeypa
 
 
 def at_every_byte(path: Path, look: Callable[[], object], whole_from: int = 1) -> int:
-    """Cut a file at every byte, and look; return how often one line refused it.
-
-    A file that lacks up to `whole_from` bytes, such as the last line feed, may pass for whole.
-    """
+    """Cut a file at every byte, and look; return how often one line refused it. A file that lacks up to
+    `whole_from` bytes, such as the last line feed, may pass for whole."""
     content, refused = path.read_bytes(), 0
     expected = look()
     for size in range(len(content)):

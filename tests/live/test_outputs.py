@@ -2,7 +2,6 @@
 
 import errno
 import socket
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from unittest.mock import Mock
@@ -78,9 +77,7 @@ MILLIMETRE = 1e-3
 
 
 @pytest.mark.slow
-def test_vmc_and_files_have_the_joints_of_a_tall_wearer_s_stream(
-    tmp_path: Path, step_files: Callable[[str], Path]
-):
+def test_vmc_and_files_have_the_joints_of_a_tall_wearer_s_stream(tmp_path: Path, step_files):
     space, count = SPACES["openxr"], 60 * SECONDS
     person = wearer.person(np.arange(count) / 60)
     stream, shown = (

@@ -1,8 +1,6 @@
-"""The live stream: the numbers of evaluation, in every space, and what happens to disturbed trackers.
-
-Bounds are a little above what was measured. A comment beside each bound gives that, and what it would be
-without the treatment that is tested.
-"""
+"""The live stream: the numbers of evaluation, in every space, and what happens to disturbed trackers. Bounds
+are a little above what was measured. A comment beside each bound gives that, and what it would be without the
+treatment that is tested."""
 
 import sys
 from pathlib import Path
@@ -157,10 +155,8 @@ def test_after_a_gap_or_a_reset_the_stream_is_as_a_new_one(file, undisturbed):
     [((1,), 8, 3000), ((0,), 48, 4500)],
 )
 def test_lost_trackers_are_held_and_come_back(trackers, during, speed, file, undisturbed):
-    """They are lost for half a second.
-
-    Without a smooth return the fastest joint would have 7585 and 12736 cm/s; undisturbed it has 1340.
-    """
+    """They are lost for half a second. Without a smooth return the fastest joint would have 7585 and 12736
+    cm/s; undisturbed it has 1340."""
     lost = {index: trackers for index in range(100, 130)}
     poses = wearer.play(Stream(file), PERSON.positions, PERSON.rotations, lost=lost)
     names = tuple(("head", "left", "right")[tracker] for tracker in trackers)

@@ -92,10 +92,8 @@ class Sample:
 
 
 def tree(skeleton: str, seed: int = 3) -> Sample:
-    """Make the skeleton of `TREES`, without motion.
-
-    The rotation channels' order is drawn for each joint, unless the map's `rest` has values of the joint.
-    """
+    """Make the skeleton of `TREES`, without motion. The rotation channels' order is drawn for each joint,
+    unless the map's `rest` has values of the joint."""
     random = np.random.default_rng(seed)
     names, parents, offsets, ends = [], [], [], []
     for entry in TREES[skeleton].replace("\n", " ").split(";"):
@@ -113,10 +111,8 @@ def tree(skeleton: str, seed: int = 3) -> Sample:
 
 
 def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sample:
-    """Make a file of random rotations, frame 0 being the zero pose.
-
-    Joints that lie between mapped ones turn only if `folded`.
-    """
+    """Make a file of random rotations, frame 0 being the zero pose. Joints that lie between mapped ones turn
+    only if `folded`."""
     sample, random = tree(skeleton, seed), np.random.default_rng([seed, 1])
     values = random.uniform(-180, 180, (frames, sample.values.shape[1]))
     values[:, :6] *= [0.01, 0.01, 0.01, 0.1, 0.1, 0.1]  # nobody is faster

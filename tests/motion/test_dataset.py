@@ -46,9 +46,7 @@ CLIP = tiny.clip(20)
 
 
 TWINS = [
-    JOINTS.index(
-        "".join({"left": "right", "right": "left"}.get(word, word) for word in re.split("(_)", name))
-    )
+    JOINTS.index("".join({"left": "right", "right": "left"}.get(one, one) for one in re.split("(_)", name)))
     for name in JOINTS
 ]
 

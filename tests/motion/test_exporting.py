@@ -54,9 +54,7 @@ def test_names_are_kept_and_bad_or_equal_ones_refused(folder: Path, tmp_path: Pa
         plan_export(folder, tmp_path / "out", "bvh")
 
 
-def test_a_clip_keeps_its_rate_or_gets_another_and_is_exported_on_its_import_s_body(
-    folder: Path, tmp_path: Path
-):
+def test_a_clip_keeps_its_rate_or_gets_another_and_is_exported_on_its_import_s_body(folder, tmp_path):
     export(plan_export(folder / "walk.npz", tmp_path / "own.bvh"))
     export(plan_export(folder / "walk.npz", tmp_path / "new" / "half.BVH"), fps=60)
     own, half = read_bvh(tmp_path / "own.bvh"), read_bvh(tmp_path / "new" / "half.BVH")

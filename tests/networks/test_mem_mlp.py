@@ -42,8 +42,7 @@ def test_paper_profile_has_the_papers_parameters():
 @torch.no_grad()
 def test_memory_sees_the_shifted_past_or_that_of_the_window_before(shift, new):
     """The past of frame t is the inputs and own first estimates `shift` earlier; in calls of a window it is,
-    whatever the shift, the inputs and the output of the call before.
-    """
+    whatever the shift, the inputs and the output of the call before."""
     model, seen = tiny.model(CodeMemory, shift=shift), []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
     size, call, sparse = model.frames, 28 // new, SPARSE[:, :35]

@@ -513,9 +513,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_a_bad_checkpoint_is_one_line_and_leaves_nothing(
-    kind: str, sound: dict[str, Tensor], tmp_path: Path
-) -> None:
+def test_a_bad_checkpoint_is_one_line_and_leaves_nothing(kind: str, sound: dict[str, Tensor], tmp_path: Path):
     path = tmp_path / "net.pth"
     HOSTILE[kind](path, sound)
     text = run(tmp_path, "import-weights", "agrol_mlp", "net.pth", *BRIEF, code=2)

@@ -46,9 +46,7 @@ def test_each_member_learns_by_itself_and_live_they_are_averaged():
 def test_arms_reach_where_a_pose_is_made_and_not_where_it_is_learned():
     """So that training is that of global rotations."""
     models = [tiny.recurrent_poser(Heading(), output=output) for output in ("global", "reaching")]
-    learned = [
-        model.compute_training_outputs(SPARSE, model.initial_state(), CLIP[None])[0] for model in models
-    ]
+    learned = [m.compute_training_outputs(SPARSE, m.initial_state(), CLIP[None])[0] for m in models]
     assert torch.equal(*learned)
     made = [model.advance(SPARSE, model.initial_state())[0] for model in models]
     hands = SPARSE[..., SPARSE_POSITION].unflatten(-1, (3, 3))[..., 1:, :]

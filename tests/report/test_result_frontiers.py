@@ -69,9 +69,7 @@ def test_the_page_has_a_picture_and_its_file_the_costs(table: Table):
     sources = {"budgets": KeptTable(kept, table)}
     made = make_pages(sources, {})
     assert "(budgets_frontier.svg)" in made["budgets.md"]
-    costs = {
-        (line["variant"], line["metric"]): line["mean"] for line in parse_csv(made["tables/budgets.csv"])
-    }
+    costs = {(one["variant"], one["metric"]): one["mean"] for one in parse_csv(made["tables/budgets.csv"])}
     assert float(costs["RPM, optim.tflop=20", "tflop"]) == pytest.approx(20.05)
     assert costs["RPM, optim.tflop=20", "seconds"] == "300"
     (picture,) = draw_pictures(sources).values()

@@ -1,6 +1,5 @@
 """Pages of results: tables, and templates whose numbers and verdicts come from the tables."""
 
-import functools
 import itertools
 import json
 import re
@@ -16,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
 from memmlp.report.tables.build_table import group_clips, make_table
-from memmlp.report.tables.statistics import Verdict, estimate_error
+from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table_text import format_counts
 from memmlp.sweep.definition import Sweep
 
@@ -126,9 +125,7 @@ def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResult
     assert fill('{{ leaders(["t", "t"], "MPJPE", "ms") }}', made) == text
 
 
-def test_a_mean_over_more_clips_than_the_controls_has_the_shared_clips_beside_it(
-    sweep: Sweep, kept: KeptResults
-):
+def test_a_mean_over_more_clips_than_the_controls_has_the_shared_clips_beside_it(sweep, kept):
     made = source(sweep, kept)
     row = next(row for row in made.table.rows if row.label == "2")
     control = next(one for one in made.table.rows if one.label == row.against).cells["stream"]["MPJPE"]
@@ -166,69 +163,11 @@ def test_bad_templates_are_one_line(sweep: Sweep, kept: KeptResults, template: s
     assert "\n" not in str(raised.value)
 
 
-@functools.cache
-def clones_tables() -> dict[str, KeptTable]:
-    """The tables of the clone's kept results, computed once for the tests that read them."""
-    return make_tables(DOCS)
-
-
 @pytest.mark.slow
 def test_pages_of_the_clone_are_made_again_byte_for_byte():
     templates = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "templates").glob("*.md")}
-    made = make_pages(clones_tables(), templates)
-    assert "README.md" in made
-    assert {f"tables/{name}.csv" for name in clones_tables()} < set(made)
+    tables = make_tables(DOCS)
+    made = make_pages(tables, templates)
+    assert {"README.md", *(f"tables/{name}.csv" for name in tables)} < set(made)
     for name, text in made.items():
         assert (DOCS / name).read_bytes() == text.encode(), name
-
-
-@pytest.mark.slow
-def test_every_interval_of_the_clone_follows_from_what_is_kept():
-    """The intervals in the files are computed here from the per-clip results, and are equal."""
-    for name in ("mix", "networks", "table14"):  # the first two have several sources
-        one = clones_tables()[name]
-        content = json.loads((DOCS / "data" / f"{name}.json").read_text())
-        lines = parse_csv((DOCS / "tables" / f"{name}.csv").read_text())
-        rows = {(clips, row.label): row for clips, table in one.by_clips.items() for row in table.rows}
-        checked = 0
-        for line in lines:
-            row = rows[line["test clips"], line["variant"]]
-            table = one.by_clips[line["test clips"]]
-            branches = {other.label: other.branch for other in table.rows}
-            own = (row.branch, branches.get(line["compared with"]))
-            if line["difference low"] and (line["branch"], line["its branch"]) == own:
-                clips = None if line["test clips"] == "all" else line["test clips"]
-                interval = by_hand(content, row, table, line["mode"], line["metric"], clips)
-                shown = float(line["difference low"]), float(line["difference high"])
-                assert shown == pytest.approx(interval, rel=1e-4)
-                checked += 1
-        assert checked == sum(
-            cell.effect is not None and cell.effect.low is not None
-            for row in rows.values()
-            for cells in row.cells.values()
-            for cell in cells.values()
-        )
-
-
-def by_hand(content: dict, row, table, mode: str, metric: str, source: str | None) -> tuple[float, float]:
-    """Compute the interval of a row's difference from its control, from a file's content alone.
-
-    source: whose clips count; None for all.
-    """
-    branches = {other.label: other.branch for other in table.rows}
-    cells = {label: content["cells"][label] for label in (row.label, row.against)}
-    seeds = sorted(set(cells[row.label]) & set(cells[row.against]))
-    every = {label: [content["runs"][by_seed[seed]] for seed in seeds] for label, by_seed in cells.items()}
-    clips = [{clip: rest for clip, *rest in content["clips"][runs[0]["clips"]]} for runs in every.values()]
-    groups = {
-        clip: group
-        for clip, (group, *rest) in clips[0].items()
-        if clip in clips[1] and (source is None or rest == [source])
-    }
-    sides = []
-    for (label, runs), names in zip(every.items(), clips, strict=True):
-        places = [list(names).index(clip) for clip in groups]
-        sides.append(np.array([run["errors"][mode][branches[label]][metric] for run in runs])[:, places])
-    differences = (sides[0] - sides[1])[None]
-    half = estimate_error(differences, np.array(list(groups.values()))).compute_half_width(0.05)[0]
-    return float(differences.mean() - half), float(differences.mean() + half)

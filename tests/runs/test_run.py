@@ -99,9 +99,7 @@ def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, gr
 
 def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     run, versions = begun(tmp_path), memmlp.runs.identity.VERSIONS
-    int8, fp32 = (
-        {"export": {"graph": "naive", "precision": one}, "evaluation": {}} for one in ("int8", "fp32")
-    )
+    int8, fp32 = ({"export": {"graph": "naive", "precision": p}, "evaluation": {}} for p in ("int8", "fp32"))
 
     def make(config: dict, value: float, graph: bytes) -> None:
         settings = identity.select_evaluation_settings(config, "stream")

@@ -33,9 +33,7 @@ CODES, QUICK, SLOW = ("c" * 16,), ("a" * 16, "b" * 16), ("d" * 16, "e" * 16)
 def plan(tmp_path: Path) -> Plan:
     """Two variants of two seeds each, and what is prerequisite of them."""
     variants = {"quick": QUICK, "slow": SLOW}
-    entries = [
-        Entry(variant, seed, name) for variant, names in variants.items() for seed, name in enumerate(names)
-    ]
+    entries = [Entry(one, seed, name) for one, names in variants.items() for seed, name in enumerate(names)]
     tasks = [RunTask(CODES[0], "vqvae", {})]
     tasks += [RunTask(entry.id, "memmlp", {}, CODES[0]) for entry in entries]
     return Plan("trial", tmp_path, tuple(entries), tuple(tasks))

@@ -1,7 +1,5 @@
 """The shipped sweep files: they load, their variants differ, and their paper values are those printed.
-
-paper_values.yaml has the printed values, transcribed apart from the sweeps.
-"""
+paper_values.yaml has the printed values, transcribed apart from the sweeps."""
 
 import functools
 from dataclasses import replace
@@ -82,9 +80,7 @@ def test_a_row_that_changes_more_than_its_label_names_is_confounded():
         for label, variant in variants.items():
             control = sweep.find_control(variant)
             if control and variants[control].cell == variant.cell:
-                one, other = (
-                    compose_flat(*sweep.merge_overrides(row)) for row in (variant, variants[control])
-                )
+                one, other = (compose_flat(*sweep.merge_overrides(v)) for v in (variant, variants[control]))
                 keys = {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}
                 changed = {key.split(".")[0] for key in keys} - {"evaluation", "seed"}
                 several = len(changed) > OF_SEVERAL.get(label, 1)

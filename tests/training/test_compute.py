@@ -24,10 +24,8 @@ def test_it_is_what_torch_counts_in_a_step(name):
 
 
 def test_lstms_count_like_other_products():
-    """HMD-Poser's LSTMs run in a kernel that torch does not count.
-
-    There are three products of each weight with each frame; the first hidden state has no gradient.
-    """
+    """HMD-Poser's LSTMs run in a kernel that torch does not count. There are three products of each weight
+    with each frame; the first hidden state has no gradient."""
     task = TASKS["hmd_poser"]()
     (block,) = task.model.blocks
     inward, again = (sum(part.directions[n].numel() for part in block.over_time) for n in (0, 1))

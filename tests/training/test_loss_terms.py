@@ -151,9 +151,7 @@ def test_learned_weights_begin_as_given_and_find_the_reciprocals_of_their_terms(
     assert loss.weighting.weights() == pytest.approx(weights)
     given = MADE, TRUE[..., SPARSE_DIM:], TRUE[..., :SPARSE_DIM], NORMALIZER
     total, parts = loss(*given)
-    expected = sum(
-        weights[name] * float(term.detach()) - np.log(weights[name]) for name, term in parts.items()
-    )
+    expected = sum(weights[n] * float(term.detach()) - np.log(weights[n]) for n, term in parts.items())
     assert float(total.detach()) == pytest.approx(expected, rel=1e-5)
     (group,) = loss.weighting.parameter_groups()
     assert (group["lr"], group["weight_decay"], len(group["params"])) == (0.1, 0.0, 2)

@@ -10,7 +10,7 @@ from tiny_tasks import motion_task, weights
 from torch import nn
 
 from memmlp.runs.run import Run
-from memmlp.training.loop import ValidationCallback, train
+from memmlp.training.loop import train
 from memmlp.training.optim import (
     EMA,
     BatchedMuon,
@@ -39,9 +39,7 @@ def kill(step: int, values: dict[str, float]) -> None:
     raise Kill
 
 
-def trained(
-    optim: Optim, folder: Path, on_validation: ValidationCallback | None = None
-) -> tuple[MotionTask, Run]:
+def trained(optim: Optim, folder: Path, on_validation=None) -> tuple[MotionTask, Run]:
     folder.mkdir(exist_ok=True)
     task, run = motion_task("forced", optim), Run(folder)
     train(task, optim, run, 0, "optim", on_validation)

@@ -51,9 +51,7 @@ def test_a_cache_has_the_clips_of_training(memmlp, tmp_path: Path, monkeypatch: 
     (tmp_path / "clips").mkdir()
     monkeypatch.chdir(tmp_path)
     found: list[ClipFolder] = []
-    monkeypatch.setattr(
-        "memmlp.motion.preparing.cache.prepare_cache", lambda source, out: found.append(source)
-    )
+    monkeypatch.setattr("memmlp.motion.preparing.cache.prepare_cache", lambda one, out: found.append(one))
     monkeypatch.setattr(commands, "show_manifest", lambda manifest: None)
     for words, train in (
         (["data.split.val=0.2"], ["data=mocap", "data.split.val=0.2"]),

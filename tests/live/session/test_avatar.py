@@ -43,9 +43,7 @@ def of_vrm_0(content: dict[str, Any]) -> None:
     """The same in VRM 0.0, where avatars face -Z."""
     bones = content["extensions"].pop("VRMC_vrm")["humanoid"]["humanBones"]
     content["extensionsUsed"] = ["VRM"]
-    listed = [
-        {"bone": name, "node": about["node"], "useDefaultValues": True} for name, about in bones.items()
-    ]
+    listed = [{"bone": name, "node": one["node"], "useDefaultValues": True} for name, one in bones.items()]
     meta = {"title": "old", "author": "nobody", "licenseName": "CC0"}
     content["extensions"]["VRM"] = {
         "specVersion": "0.0", "meta": meta, "humanoid": {"humanBones": listed},
@@ -76,10 +74,8 @@ def browser() -> Iterator[Browser]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("edit", "size"), [(lambda _: None, 1.0), (without_chest, 1.2), (of_vrm_0, 1.2)])
 def test_an_avatar_s_bones_are_where_the_joints_are(browser, own: bytes, clip, edit, size: float):
-    """Within what whole millimetres leave; of a wearer of another size, too.
-
-    An avatar that lacks bones stands otherwise, but all its bones have the right direction.
-    """
+    """Within what whole millimetres leave; of a wearer of another size, too. An avatar that lacks bones
+    stands otherwise, but all its bones have the right direction."""
     (size_of_json,) = struct.unpack_from("<I", own, 12)
     content, rest = json.loads(own[20 : 20 + size_of_json]), own[20 + size_of_json :]
     edit(content)

@@ -121,9 +121,7 @@ def joints() -> list[list[dict[str, Any]]]:
     rows = (
         np.frombuffer(pack_clip("", PERSON.frames.numpy(), 4.0).content, "<f4").reshape(-1, NUMBERS).tolist()
     )
-    return [
-        [{"position": row[3 * i :][:3], "rotation": row[9 + 4 * i :][:4]} for i in range(3)] for row in rows
-    ]
+    return [[{"position": r[3 * i :][:3], "rotation": r[9 + 4 * i :][:4]} for i in range(3)] for r in rows]
 
 
 def read_body(site: Made) -> dict[str, Any]:
@@ -137,10 +135,8 @@ def t_pose(site: Made) -> list[dict[str, Any]]:
 
 
 def worn(browser: Browser, site: Made) -> dict[str, Any]:
-    """Enter VR, calibrate in T-pose, move as the clip does, leave, choose another network.
-
-    A calibration before, with exchanged hands and another height, is refused, and changes nothing.
-    """
+    """Enter VR, calibrate in T-pose, move as the clip does, leave, choose another network. A calibration
+    before, with exchanged hands and another height, is refused, and changes nothing."""
     go(browser, "vr", f"{SITE}.vr == 'ready'")
     assert browser.value(REMARKED) == f"This network is {REMARK}."
     browser.resolved(TWO)

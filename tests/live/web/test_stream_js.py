@@ -78,9 +78,7 @@ def gone(first: int, end: int, *which: int) -> dict[int, tuple[int, ...]]:
 def untracked() -> list[dict[str, Any]]:
     """Samples in which programs report lost trackers in all ways, the head too, and two freeze."""
     made = samples(np.arange(240) / 60)
-    lost = [
-        pose and dict(zip(("position", "rotation"), pose, strict=True)) for is_lost, pose in POSES if is_lost
-    ]
+    lost = [pose and dict(zip(("position", "rotation"), pose, strict=True)) for gone, pose in POSES if gone]
     for index, pose in enumerate(
         json.loads(json.dumps(lost).replace("Infinity", "NaN").replace("NaN", "null"))
     ):
@@ -167,9 +165,7 @@ def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
     if stream.offsets is not None:
         offsets = answers[name]["offsets"]
         np.testing.assert_allclose(offsets["positions"], stream.offsets.positions, atol=1e-9)
-        turns = np.abs(
-            (np.array(offsets["rotations"]) * matrix_to_quaternion(stream.offsets.rotations)).sum(1)
-        )
+        turns = np.abs((offsets["rotations"] * matrix_to_quaternion(stream.offsets.rotations)).sum(1))
         np.testing.assert_allclose(turns, 1, atol=1e-9)
 
 

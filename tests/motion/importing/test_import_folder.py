@@ -76,9 +76,7 @@ def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
     assert str(tmp_path) not in (tmp_path / "out" / "import.json").read_text()
 
 
-def test_a_strict_or_failed_import_leaves_no_record_of_other_clips(
-    source: Path, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_strict_or_failed_import_leaves_no_record_of_other_clips(source: Path, tmp_path: Path, monkeypatch):
     import_folder(source, tmp_path / "out")
     before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")}
     write(source, person("cmu_daz", 9, 9).text(), "indian/01.bvh")

@@ -55,9 +55,7 @@ def test_clips_without_a_row_and_rows_without_a_clip_are_named(tmp_path):
 
 def manifest_of(parts: Sequence[tuple[str, str]], split: dict[str, Any], tied: Sequence[str] = ()) -> Any:
     """A manifest with clips in parts; those of `tied` are in one group."""
-    clips = [
-        SimpleNamespace(name=name, split=part, group="tied" if name in tied else name) for name, part in parts
-    ]
+    clips = [SimpleNamespace(name=n, split=part, group="tied" if n in tied else n) for n, part in parts]
     return SimpleNamespace(clips=clips, split=split)
 
 

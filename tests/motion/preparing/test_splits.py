@@ -37,9 +37,7 @@ def test_groups_and_subjects_within_archives_stay_together():
     split = seeded(0.2, 0.2, 1, ["^([^/]+/[^/]+)/"])
     expected = split.assign(names).parts
     for write in (in_archives, "archive-1/{}".format):
-        assert split.assign([*map(write, names)]).parts == {
-            write(one): part for one, part in expected.items()
-        }
+        assert split.assign([*map(write, names)]).parts == {write(a): part for a, part in expected.items()}
     for seed in range(5):
         parts = seeded(0.2, 0.2, seed, TWINS).assign(NAMES).parts
         assert all(parts[f"salsa/{n:02}"] == parts[f"salsa/{n + 15:02}"] for n in range(1, 16))

@@ -44,9 +44,7 @@ def test_a_mean_has_the_interval_of_its_errors(sweep: Sweep, tmp_path: Path):
     groups = {clip: clip[:7] for clip in CLIPS}
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS, groups=groups))
     found = cell(make_table(sweep, runs), "full_model", "MPJPE")
-    errors = [
-        run.get_clip_values(CLIPS, "stream", "rotation", "MPJPE") for run in runs["full_model"].values()
-    ]
+    errors = [r.get_clip_values(CLIPS, "stream", "rotation", "MPJPE") for r in runs["full_model"].values()]
     expected = estimate_paired_effects(np.array([errors]), [groups[clip] for clip in CLIPS])
     assert (found.low, found.high) == pytest.approx((expected.low[0], expected.high[0]))
     assert found.low < found.mean < found.high

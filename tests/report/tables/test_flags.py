@@ -344,9 +344,7 @@ def test_seeds_that_share_a_vqvae(flags: Callable[..., list[str]]):
     ("fact", "begin"),
     [("divided", ""), ("resampled", ""), ("unusual", ""), ("partial", "trained on a part of the data: ")],
 )
-def test_warnings_about_the_data(
-    flags: Callable[..., list[str]], sweep: Sweep, tmp_path: Path, fact: str, begin: str
-):
+def test_warnings_about_the_data(flags, sweep: Sweep, tmp_path: Path, fact: str, begin: str):
     origin = {"origin": {fact: "a warning"}}
     found = flags("a warning", lambda label, _: origin if label != LABELS[0] else {})
     assert found == [f"{begin}a warning: 'by position', 'full_model'"]

@@ -25,9 +25,7 @@ TRUTH = {"full": 0.0, "worse": 2.0, "same": 0.0, "unsure": 0.09}  # the smallest
 Draw = Callable[[str, int, str], np.ndarray]  # (label, seed, "mode metric") -> the error on each clip
 
 
-def run(
-    label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: Mapping[str, str]
-) -> MeasuredRun:
+def run(label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: dict[str, str]) -> MeasuredRun:
     modes = ("stream", "window")
     numbers = {mode: {m: draw(label, seed, f"{mode} {m}") for m in metrics} for mode in modes}
     several = len(next(iter(numbers["stream"].values())))
@@ -51,9 +49,7 @@ class World:
     def __init__(self, sweep: Sweep = SWEEP, draw: Draw = planted, groups: Mapping[str, str] | None = None):
         self.sweep, self.draw, self.groups = sweep, draw, groups or {}
         self.failing: set[tuple[str, int]] = set()
-        self.runs: dict[str, dict[int, MeasuredRun]] = {
-            variant.label: {} for variant in sweep.list_runnable()
-        }
+        self.runs: dict[str, dict[int, MeasuredRun]] = {one.label: {} for one in sweep.list_runnable()}
 
     def spend(self, rounds: Rounds) -> Mapping[str, RunsBySeed]:
         spent = rounds.restrict_sweep(self.sweep)
@@ -70,9 +66,7 @@ class World:
         return rounds
 
     def look(self, rounds: Rounds) -> Rounds:
-        names = {
-            label: f"{label} {number}" for label, number in rounds.find_next_analyses(self.sweep).items()
-        }
+        names = {label: f"{label} {n}" for label, n in rounds.find_next_analyses(self.sweep).items()}
         return do_next_analysis(rounds, self.sweep, self.spend(rounds), names)
 
 
@@ -186,11 +180,9 @@ def normal(number: int, seed: int, label: str, metric: str) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize(("truth", "noise"), [(0.0, 5.0), (1.0, 0.5)])
 def test_false_claims_keep_to_the_level_over_all_rounds(truth: float, noise: float):
-    """Differences vary by seed alone, where p-values are exact, and two clips say as much as more.
-
-    `truth` is the true difference of all variants: 0, or 1, the smallest effect of interest, where a claim of
-    equivalence is false.
-    """
+    """Differences vary by seed alone, where p-values are exact, and two clips say as much as more. `truth` is
+    the true difference of all variants: 0, or 1, the smallest effect of interest, where a claim of
+    equivalence is false."""
     variants = {"full": [], **{f"variant {number}": [f"a={number}"] for number in range(5)}}
     sweep = parse_sweep("null", {"metrics": ["MPJPE"], "smallest": {"MPJPE": 1.0}, "variants": variants})
     false = ("equivalent",) if truth else ("higher", "lower")

@@ -53,9 +53,7 @@ def test_damage_is_listed_and_raises_nothing(outputs: Path, name: str, content: 
 
 def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     parsed = []
-    monkeypatch.setattr(
-        run_index, "read_facts", lambda folder: parsed.append(folder.name) or read_facts(folder)
-    )
+    monkeypatch.setattr(run_index, "read_facts", lambda one: parsed.append(one.name) or read_facts(one))
     index = RunIndex(outputs)
     first = index.refresh()
     assert (index.refresh(), len(parsed)) == (first, 6)

@@ -116,9 +116,7 @@ def test_other_hosts_and_other_pages_get_nothing(server: RunsServer, headers: di
 
 def post(server: RunsServer, body: object, **headers: str) -> Answer:
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
-    given = {"X-Memmlp-Token": server.change_token} | {
-        key.replace("_", "-"): one for key, one in headers.items()
-    }
+    given = {"X-Memmlp-Token": server.change_token} | {k.replace("_", "-"): one for k, one in headers.items()}
     connection.request("POST", "/api/change", json.dumps(body), given)
     response = connection.getresponse()
     answer = Answer(response.status, response.read(), response.headers)
@@ -154,9 +152,7 @@ def test_the_page_changes_runs_and_every_change_is_logged(server: RunsServer, ou
     assert get(server, "/api/views").json == {"views": {}}
 
 
-def test_a_change_needs_the_token_the_origin_and_a_writable_folder(
-    server: RunsServer, outputs: Path, monkeypatch
-):
+def test_a_change_needs_the_token_the_origin_and_a_writable_folder(server: RunsServer, outputs, monkeypatch):
     run = run_of(outputs)
     tag = {"action": "tags", "value": "good", "runs": [run.id]}
     for headers in (

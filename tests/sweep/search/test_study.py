@@ -32,9 +32,7 @@ def test_a_grid_has_each_combination_once_in_order_however_often_it_is_stopped(t
         finish(one.update(1))
     study = open_study(tmp_path, **grid)
     to_the_end(study, tmp_path, capacity=1)
-    every = [
-        {"loss.rotation_all": one, "loss.hand": other} for one in (1.0, 2.0) for other in (0.1, 0.2, 0.3)
-    ]
+    every = [{"loss.rotation_all": a, "loss.hand": b} for a in (1.0, 2.0) for b in (0.1, 0.2, 0.3)]
     assert [trial.params for trial in study.trials] == every
 
 
