@@ -5,12 +5,11 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from docs.results.make_pages import KeptTable, make_pages, make_tables, shorten_remark
+from docs.results.make_pages import KeptTable, make_pages, shorten_remark
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
@@ -18,9 +17,6 @@ from memmlp.report.tables.build_table import group_clips, make_table
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table_text import format_counts
 from memmlp.sweep.definition import Sweep
-
-ROOT = Path(__file__).parent.parent.parent
-DOCS = ROOT / "docs" / "results"
 
 
 def source(sweep: Sweep, kept: KeptResults) -> KeptTable:
@@ -161,13 +157,3 @@ def test_bad_templates_are_one_line(sweep: Sweep, kept: KeptResults, template: s
         fill(template, source(sweep, kept))
     assert str(raised.value).startswith("README.md")
     assert "\n" not in str(raised.value)
-
-
-@pytest.mark.slow
-def test_pages_of_the_clone_are_made_again_byte_for_byte():
-    templates = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "templates").glob("*.md")}
-    tables = make_tables(DOCS)
-    made = make_pages(tables, templates)
-    assert {"README.md", *(f"tables/{name}.csv" for name in tables)} < set(made)
-    for name, text in made.items():
-        assert (DOCS / name).read_bytes() == text.encode(), name
