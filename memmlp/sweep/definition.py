@@ -116,11 +116,7 @@ class Sweep:
 
         A variant keeps a branch that the file sets for it. The paper's values belong to the printed branch,
         so a variant loses them when its branch changes.
-
-        Raises:
-            InputError: for an unknown branch.
         """
-        parse_branch(branch, "branch")
         variants = tuple(
             one if one.fixed or one.branch == branch else replace(one, branch=branch, paper={})
             for one in self.variants
