@@ -128,6 +128,7 @@ def stop_and_retry(outputs: Path, stops: int, dice: random.Random) -> Iterator[C
             idle = 0
             while counts["left"] > 0:
                 time.sleep(dice.uniform(*PAUSES) / 3)
+                prioritize_last(server, outputs, counts)
                 runs = [Run(folder) for folder in outputs.glob("runs/*/")]
                 unfinished = [
                     run for run in runs if run.activity or (run.checkpoint.exists() and not run.done)
@@ -144,7 +145,6 @@ def stop_and_retry(outputs: Path, stops: int, dice: random.Random) -> Iterator[C
                     if stopped:
                         counts["seen"] += run.state(run.complete) == "stopped"
                         counts["left"] -= change(server, run, "retry")
-                    prioritize_last(server, outputs, counts)
             print(f"{stops - counts['late']} stops, of which {counts['seen']} were obeyed before their retry")
             print(f"{counts['prioritized']} waiting runs prioritised, of which {counts['next']} were next")
 
@@ -155,16 +155,21 @@ def stop_and_retry(outputs: Path, stops: int, dice: random.Random) -> Iterator[C
 
 
 def prioritize_last(server: RunsServer, outputs: Path, counts: Counter[str]) -> None:
-    """Prioritise the last run that no worker has taken, and count whether a worker takes it next."""
+    """Prioritise the last run that no worker has taken, and count whether a worker takes it or its
+    prerequisite next."""
     tasks = [task for path in outputs.glob("sweeps/*/plan.json") for task in Plan.load(path).tasks]
-    runs = [Run.from_id(outputs, task.id) for task in tasks]
-    waiting = [run.folder for run in runs if not Lock(run.folder).list_claims()]
-    if len(waiting) > 1 and change(server, Run(waiting[-1]), "prioritize"):
+
+    def list_waiting() -> list[str]:
+        return [task.id for task in tasks if not Lock(outputs / "runs" / task.id).list_claims()]
+
+    waiting = list_waiting()
+    if len(waiting) > 1 and change(server, Run.from_id(outputs, waiting[-1]), "prioritize"):
+        first = next({task.id, task.prerequisite} for task in tasks if task.id == waiting[-1])
         end = time.monotonic() + PATIENCE
-        while not (taken := [one for one in waiting if Lock(one).list_claims()]) and time.monotonic() < end:
+        while not (taken := {*waiting} - {*list_waiting()}) and time.monotonic() < end:
             time.sleep(0.02)
         counts["prioritized"] += bool(taken)
-        counts["next"] += waiting[-1] in taken
+        counts["next"] += bool(taken & first)
 
 
 def change(server: RunsServer, run: Run, action: str) -> bool:
