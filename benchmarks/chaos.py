@@ -155,21 +155,20 @@ def stop_and_retry(outputs: Path, stops: int, dice: random.Random) -> Iterator[C
 
 
 def prioritize_last(server: RunsServer, outputs: Path, counts: Counter[str]) -> None:
-    """Prioritise the last run that no worker has taken, and count whether a worker takes it or its
-    prerequisite next."""
+    """Prioritise the last waiting run that needs no other run, and count whether a worker takes it next."""
     tasks = [task for path in outputs.glob("sweeps/*/plan.json") for task in Plan.load(path).tasks]
 
     def list_waiting() -> list[str]:
         return [task.id for task in tasks if not Lock(outputs / "runs" / task.id).list_claims()]
 
     waiting = list_waiting()
-    if len(waiting) > 1 and change(server, Run.from_id(outputs, waiting[-1]), "prioritize"):
-        first = next({task.id, task.prerequisite} for task in tasks if task.id == waiting[-1])
+    free = [task.id for task in tasks if task.id in waiting and not task.prerequisite]
+    if len(free) > 1 and change(server, Run.from_id(outputs, free[-1]), "prioritize"):
         end = time.monotonic() + PATIENCE
         while not (taken := {*waiting} - {*list_waiting()}) and time.monotonic() < end:
             time.sleep(0.02)
         counts["prioritized"] += bool(taken)
-        counts["next"] += bool(taken & first)
+        counts["next"] += free[-1] in taken
 
 
 def change(server: RunsServer, run: Run, action: str) -> bool:
