@@ -17,6 +17,7 @@ def test_command_prints_a_table(memmlp: Memmlp, planned: None, monkeypatch: pyte
     assert ran.out.count("3/3") == 8
     assert max(map(len, ran.out.splitlines())) <= 100
     assert memmlp("table", "13", "--mode", "window").out.count("3/3") == 3
+    assert "measured: data.root" in memmlp("table", "1").out
 
 
 def test_command_shows_another_branch_and_puts_clips_together(memmlp: Memmlp, planned: None):
@@ -40,9 +41,7 @@ def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, 
 
 def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("memmlp.common.progress.INTERVAL", 0.0)
-    monkeypatch.setattr(
-        "memmlp.config.compose_plan.make_plan", lambda sweep, *_: Plan(sweep.name, Path(), (), ())
-    )
+    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", lambda *_: Plan("", Path(), (), ()))
     ran = memmlp("table", "all", "--format", "json")
     assert len(json.loads(ran.out)) == 17
     assert "tables: 1 of 17" in ran.err

@@ -10,6 +10,7 @@ from memmlp.runs.identity import (
     affects_training,
     compute_deployment_id,
     compute_evaluation_id,
+    describe_export_difference,
 )
 
 
@@ -54,6 +55,7 @@ def test_a_stage_has_an_id_of_its_own_keys():
     assert moved(evaluation__ik_iterations=3) == [False, False, False]  # there is no inverse kinematics
     assert moved(evaluation__batch=1) == [False, False, False]
     assert (moved(export__a=2), moved(optim__lr=1)) == ([False, False, True], [True, False, False])
+    assert describe_export_difference({"opset": 18}, {"export": {"graph": "off"}}) == ""
     assert moved(memory__blend=1) == [False, True, True]
     rolled = {"rollout": {"name": "own_predictions"}, "memory": {"blend": 1}}
     assert identity(CONFIG | rolled) != identity(CONFIG | {**rolled, "memory": {"blend": 0}})
