@@ -126,6 +126,12 @@ def test_filter_sort_compare_and_the_address(browser: Browser, server: RunsServe
     assert browser.value(LABEL).startswith("training loss by step. memory=gru · seed")
 
 
+def test_two_runs_are_compared_in_each_key_that_differs(browser: Browser, server: RunsServer, home: Path):
+    pair = f"{run_of(home, 'gru', 0).id},{run_of(home, 'none', 1).id}"
+    go(browser, server.url, f"compare?runs={pair}", f"{NAMES}.length == 2")
+    assert browser.value(texts(".runs thead button"))[2:4] == ["memory", "seed"]
+
+
 def test_a_run_s_page_and_its_replay(browser: Browser, server: RunsServer, home: Path):
     run = run_of(home, "gru", 0)
     shown = f"document.documentElement.dataset.replayed == '{run.id} 3'"

@@ -18,8 +18,8 @@ const KEYS = 6; // config columns that are shown by default
 const METRICS = ['stream.rotation.MPJPE', 'stream.rotation.MPJRE', 'stream.rotation.MPJVE', 'stream.rotation.Jitter', 'latency.median_ms'];
 const NARROW = matchMedia('(max-width: 640px)'); // errors come before keys on a narrow screen
 
-// The keys in which these runs differ; of several that differ in the same way (memory and its sizes) the first.
-export function differing(list, keys) {
+// The keys in which these runs differ; with `first`, of several that differ in the same way (memory and its sizes) the first.
+function differing(list, keys, first = false) {
   const everywhere = key => list.every(run => (run.config[key] ?? null) !== null);
   const rank = new Map(keys.map(key => [key, key.endsWith('.name') ? 0 : key === 'seed' ? 1 : everywhere(key) ? 2 : 3]));
   const seen = new Set();
@@ -27,7 +27,7 @@ export function differing(list, keys) {
     const places = new Map();
     for (const run of list) if (!places.has(run.cells[key])) places.set(run.cells[key], places.size);
     const pattern = list.map(run => places.get(run.cells[key])).join();
-    const found = places.size > 1 && !seen.has(pattern) && !about.minor.includes(key);
+    const found = places.size > 1 && !(first && (seen.has(pattern) || about.minor.includes(key)));
     seen.add(pattern);
     return found;
   });
@@ -37,7 +37,7 @@ export function differing(list, keys) {
 function groupings(list) {
   const count = run => list.filter(other => nameOf(other) === nameOf(run)).length;
   const names = new Map(list.map(run => [run.id, count(run) > 1 ? `${nameOf(run)} (${run.id.slice(0, 6)})` : nameOf(run)]));
-  const keys = differing(list, about.keys).filter(key => key !== 'seed').slice(0, 12);
+  const keys = differing(list, about.keys, true).filter(key => key !== 'seed').slice(0, 12);
   const short = shortKeys(keys);
   return [
     ['run', 'run', id => names.get(id)],
@@ -83,7 +83,7 @@ export async function page(name, route) {
     const metrics = !networks.length ? about.metrics.filter(one => one.startsWith('vqvae.')).slice(0, 5) : only ? about.metrics.filter(one => !one.includes('GT ')) : METRICS;
     const pinned = (query.get('cols') ?? '').split(',').filter(one => about.keys.includes(one) || about.metrics.includes(one));
     const measured = metrics.filter(one => !pinned.includes(one) && ui.list.some(run => run.metrics[one] !== undefined && run.metrics[one] !== null));
-    const keys = differing(networks.length ? networks : ui.list, about.keys).slice(0, only ? undefined : KEYS).filter(one => !pinned.includes(one) && !(settings.group === 'same' && one === 'seed'));
+    const keys = differing(networks.length && !only ? networks : ui.list, about.keys, !only).slice(0, only ? undefined : KEYS).filter(one => !pinned.includes(one) && !(settings.group === 'same' && one === 'seed'));
     ui.columns = [...pinned, ...(NARROW.matches || settings.group ? [measured, keys] : [keys, measured]).flat()];
     ui.words = new Map(ui.columns.map(name => [name, columnWords(ui.list.map(run => run.config[name]))]));
     head(settings.sort);
