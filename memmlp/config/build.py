@@ -362,7 +362,15 @@ def list_overrides(config: Mapping[str, Any]) -> list[str]:
     loggers and other keys without an effect on results. Raises InputError if there are none."""
     own = flatten({key: value for key, value in config.items() if key not in NOT_REPEATED})
     plugins = [f"plugins={format_value(config['plugins'])}"] if config.get("plugins") else []
-    words = [*plugins, f"data={config['data']['name']}", f"profile={config['profile']['sizes']}"]
+    if missing := [key for key in ("data", "model", "profile") if key not in config]:
+        raise InputError(f"{missing[0]}: is not in the run's config; this version cannot compose it")
+    data = [f"data={config['data']['name']}"]  # recorded data has no default folder
+    data += (
+        [_make_repeated("data.root", own["data.root"])]
+        if "data.root" in own and data != ["data=synth"]
+        else []
+    )
+    words = [*plugins, *data, f"profile={config['profile']['sizes']}"]
     options = {slot: find_option(config, slot) for slot in SLOTS if slot in config}
     for slots in (["model"], [slot for slot in options if slot != "model"]):  # a model sets other slots
         default = _compose_plain(words)

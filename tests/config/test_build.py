@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
 
+from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, list_overrides, make_readable_name
 from memmlp.config.compose import compose_config
 from memmlp.runs.identity import select_training_config
@@ -75,10 +77,15 @@ def test_a_vqvae_and_a_component_of_ones_own():
     assert make_readable_name("memmlp", mine) == "memory=mine · seed 0"
 
 
-def test_the_overrides_of_a_recorded_config_compose_it_again():
-    given = ["data=synth", "profile=tiny", "memory=gru", "seed=3", "vqvae.seed=0", "optim.lr=0.0123"]
+@pytest.mark.parametrize("data", ["synth", "mocap"])
+def test_the_overrides_of_a_recorded_config_compose_it_again(tmp_path: Path, data: str):
+    (tmp_path / "take.npz").touch()
+    values = ["profile=tiny", "memory=gru", "seed=3", "vqvae.seed=0", "optim.lr=0.0123"]
+    given = [f"data={data}", f"data.root={tmp_path}", *values]
     config = OmegaConf.to_container(compose_config(given), resolve=True)
     words = list_overrides(config)
-    assert {"profile=tiny", "memory=gru", "seed=3", "vqvae.seed=0", "optim.lr=0.0123"} <= set(words)
+    assert set(values) <= set(words)
     again = OmegaConf.to_container(compose_config(words), resolve=True)
     assert select_training_config(again) == select_training_config(config)
+    with pytest.raises(InputError, match="model: is not in the run's config"):
+        list_overrides({"data": {"name": "synth"}})
