@@ -33,14 +33,14 @@ export function section(title, ...children) {
 }
 
 // A table. A content is text, an element, or a whole cell; the first column has the rows' heads, and `n` aligns the others right.
-export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short', caption = null } = {}) {
+export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short', caption = null, file = 'table' } = {}) {
   const cell = (content, i, head) => (content instanceof HTMLTableCellElement ? content
     : h(head || !i ? 'th' : 'td', { scope: head ? 'col' : i ? null : 'row', class: i && n ? 'n' : null }, content));
   const line = (contents, head) => h('tr', {}, contents.map((content, i) => cell(content, i, head)));
   const grid = h('table', { class: `grid ${kind}` }, caption && h('caption', {}, caption),
     heads && h('thead', {}, line(heads, true)), h('tbody', {}, rows.map(row => line(row))));
   const save = (text, onclick) => h('button', { type: 'button', title: `Save this table as ${text}`, onclick }, text);
-  const saves = heads && h('span', { class: 'save' }, save('CSV', () => download('table.csv', toCsv(grid))), save('PNG', () => savePng('table.png', grid)));
+  const saves = heads && h('span', { class: 'save' }, save('CSV', () => download(`${file}.csv`, toCsv(grid))), save('PNG', () => savePng(`${file}.png`, grid)));
   return h('div', { class: 'saved' }, saves, h('div', { class: scroll }, grid));
 }
 
@@ -48,7 +48,8 @@ export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short
 export async function savePng(name, element) {
   const [width, height] = [element.scrollWidth + 16, element.scrollHeight + 16];
   const style = `color-scheme: ${matchMedia('(prefers-color-scheme: dark)').matches ? 'dark' : 'light'}`;
-  const rules = [...document.styleSheets].flatMap(sheet => [...sheet.cssRules]).map(rule => rule.cssText).join('\n');
+  const now = rule => (!rule.media ? rule : matchMedia(rule.media.mediaText).matches ? [...rule.cssRules] : []); // a picture is wider than the window
+  const rules = [...document.styleSheets].flatMap(sheet => [...sheet.cssRules]).flatMap(now).map(rule => rule.cssText).join('\n');
   const copy = h('div', { style: `${style}; padding: 8px; height: 100%; background: var(--card); color: var(--ink); font: 14px/1.5 system-ui, sans-serif` }, h('style', {}, rules), element.cloneNode(true));
   const space = new DOMParser().parseFromString('<svg>', 'text/html').body.firstChild.namespaceURI;
   const drawn = `<svg xmlns="${space}" width="${width}" height="${height}" style="${style}"><foreignObject width="100%" height="100%">${new XMLSerializer().serializeToString(copy)}</foreignObject></svg>`;

@@ -135,8 +135,7 @@ export function forest(rows, { label, smallest }) {
 }
 
 // Errors with their intervals against a cost on a logarithmic axis, one curve for each series.
-export function frontier(points, { x, y }) {
-  const colours = colourOf(new Set(points.map(point => point.series)));
+export function frontier(points, { x, y, colours }) {
   const colour = point => colours.get(point.series);
   const words = point => `${point.variant}: ${number(point.mean)} at ${number(Number(point.cost.toPrecision(3)))}`;
   const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.6, 240), 400), {
@@ -148,7 +147,7 @@ export function frontier(points, { x, y }) {
       tip(points, { x: 'cost', y: 'mean', title: words }),
     ],
   }));
-  return figure(`${y} against ${x}. ${points.map(words).join('; ')}`, draw, [...colours].map(([series, one]) => legendKey('●', series, one)));
+  return figure(`${y} against ${x}. ${points.map(words).join('; ')}`, draw, [...new Set(points.map(point => point.series))].map(series => legendKey('●', series, colours.get(series))));
 }
 
 // Points { x, y, text, best } in two measures; a line joins the best ones, which `mark` names. open(point): called by a click.

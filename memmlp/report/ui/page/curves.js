@@ -8,7 +8,7 @@ const DEFAULT = ['train loss', 'val rotation MPJPE', 'val rotation MPJRE']; // t
 const AXES = { step: 'step', time: 'hours', samples: 'samples' };
 const title = name => name.replace(/^train /, 'training ').replace(/^val /, 'validation ');
 
-// Curves with their controls, whose settings are kept in the address. A grouping is [name, text, groupOf(id)].
+// Curves with their controls, whose settings are kept in the address. A grouping is [name, text, groupOf(id), fixed colours].
 export function curvePanel(ids, groupings) {
   const element = h('div', { class: 'curves' });
   const hidden = new Set();
@@ -24,9 +24,9 @@ export function curvePanel(ids, groupings) {
     const chosen = setting('y', '').split('|').filter(name => names.includes(name));
     const usual = DEFAULT.filter(name => names.includes(name)).slice(0, 2);
     const list = [chosen, usual, names.slice(0, 1)].find(some => some.length);
-    const [groupName, , groupOf] = groupings.find(([name]) => name === setting('group')) ?? groupings[0];
+    const [groupName, , groupOf, fixed] = groupings.find(([name]) => name === setting('group')) ?? groupings[0];
     const groups = [...new Set(ids.filter(id => id in data).map(groupOf))];
-    const colours = colourOf(groups);
+    const colours = fixed ?? colourOf(groups);
     const smooth = Number(setting('smooth', '0'));
     const log = setting('log') === 'yes';
     const axis = setting('axis', 'step');

@@ -4,7 +4,7 @@ import { cards, h, replace, link, section, empty, table, select } from './dom.js
 import { address, ask, generated, inFile, nameOf, place, remember, runs } from './store.js';
 import { button, canChange, change, command, dialog } from './actions.js';
 import { curvePanel } from './curves.js';
-import { forest, frontier } from './charts.js';
+import { colourOf, forest, frontier } from './charts.js';
 import { ACTIVE, look, state, STATE_WORDS } from './state.js';
 import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
 
@@ -36,7 +36,7 @@ export async function single(name) {
   let sweep = await ask(`sweeps/${name}`);
   const ids = [...new Set(sweep.cells.map(cell => cell.id))].filter(id => runs.has(id));
   const variants = new Map(sweep.cells.map(cell => [cell.id, cell.variant]));
-  const panel = curvePanel(ids, [['variant', 'variant', id => variants.get(id)], ['run', 'run', id => (runs.has(id) ? nameOf(runs.get(id)) : id)]]);
+  const panel = curvePanel(ids, [['variant', 'variant', id => variants.get(id), coloursOf(sweep.table)], ['run', 'run', id => (runs.has(id) ? nameOf(runs.get(id)) : id)]]);
   const top = h('div');
   const element = h('div', { class: 'page' }, top, ids.length ? section('Curves by variant', panel.element) : null, notes(sweep.table));
   function draw() {
@@ -129,6 +129,9 @@ function effects(found, draw, head = 'h2') {
     h('p', { class: 'faint' }, note), forest(rows, { label: found.headings[metric].replace(/ ↓| ↑/, ''), smallest: found.smallest[metric] }));
 }
 
+// One colour for each network on all charts of a page.
+const coloursOf = found => colourOf(new Set([...found.rows.map(row => row.series), ...found.rows.map(row => row.label)]));
+
 // Error against training compute and live latency, where the training compute is known and differs.
 const COSTS = [['parameters', 'parameters [M]'], ['MACs', 'MACs [G]'], ['tflop', 'training [TFLOP]'], ['seconds', 'training [s]'], ['ms', 'step [ms]']];
 function frontiers(found) {
@@ -138,7 +141,7 @@ function frontiers(found) {
   const metric = found.metrics.find(one => one === 'MPJPE') ?? found.metrics[0];
   const points = cost => found.rows.filter(row => row.costs[cost] !== undefined && row.cells[mode][metric].mean !== null)
     .map(row => ({ series: row.series, variant: row.label, cost: row.costs[cost], ...row.cells[mode][metric] })).sort((a, b) => a.cost - b.cost);
-  const chart = (cost, x) => frontier(points(cost), { x, y: found.headings[metric].replace(/ ↓| ↑/, '') });
+  const chart = (cost, x) => frontier(points(cost), { x, colours: coloursOf(found), y: found.headings[metric].replace(/ ↓| ↑/, '') });
   const digits = value => (value === undefined ? DASH : number(Number(value.toPrecision(3))));
   return section('Frontiers', h('p', { class: 'faint' }, 'Error with its 95 % interval over seeds and clip groups; one curve for each network.'),
     h('div', { class: 'pair' }, chart('tflop', 'training compute [TFLOP]'), chart('ms', 'live latency of a step [ms]')),
@@ -160,7 +163,7 @@ function rounds(found) {
 function results(found) {
   const row = (one, mode) => [one.confounded ? `${one.label} ‡` : one.label, one.wanted.length ? `${one.found.length}/${one.wanted.length}` : 'paper', ...found.metrics.map(metric => h('td', { class: 'n' }, cell(one.cells[mode][metric], metric), otherBranches(one, mode, metric)))];
   const heads = ['variant', 'seeds', ...found.metrics.map(metric => found.headings[metric])];
-  return h('div', { class: 'stack' }, found.modes.map(mode => table(heads, found.rows.map(one => row(one, mode)), { kind: 'effects', scroll: 'scroll', caption: found.modes.length > 1 ? `${mode} mode` : null })));
+  return h('div', { class: 'stack' }, found.modes.map(mode => table(heads, found.rows.map(one => row(one, mode)), { kind: 'effects', scroll: 'scroll', file: `${found.name}-${mode}`, caption: found.modes.length > 1 ? `${mode} mode` : null })));
 }
 
 // Differences and verdicts with variant and control in another branch than the row's.
