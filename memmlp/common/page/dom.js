@@ -48,8 +48,7 @@ export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short
 export async function savePng(name, element) {
   const [width, height] = [element.scrollWidth + 16, element.scrollHeight + 16];
   const style = `color-scheme: ${matchMedia('(prefers-color-scheme: dark)').matches ? 'dark' : 'light'}`;
-  const now = rule => (!rule.media ? rule : matchMedia(rule.media.mediaText).matches ? [...rule.cssRules] : []); // a picture is wider than the window
-  const rules = [...document.styleSheets].flatMap(sheet => [...sheet.cssRules]).flatMap(now).map(rule => rule.cssText).join('\n');
+  const rules = [...document.styleSheets].flatMap(sheet => [...sheet.cssRules]).flatMap(rule => (!rule.media ? rule : matchMedia(rule.media.mediaText).matches ? [...rule.cssRules] : [])).map(rule => rule.cssText).join('\n');
   const copy = h('div', { style: `${style}; padding: 8px; height: 100%; background: var(--card); color: var(--ink); font: 14px/1.5 system-ui, sans-serif` }, h('style', {}, rules), element.cloneNode(true));
   const space = new DOMParser().parseFromString('<svg>', 'text/html').body.firstChild.namespaceURI;
   const drawn = `<svg xmlns="${space}" width="${width}" height="${height}" style="${style}"><foreignObject width="100%" height="100%">${new XMLSerializer().serializeToString(copy)}</foreignObject></svg>`;

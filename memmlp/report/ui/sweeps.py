@@ -125,6 +125,7 @@ class Sweeps:
             "title": f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title,
             "variants": len({entry.label for entry in plan.entries}),
             "seeds": len({entry.seed for entry in plan.entries}),
+            "wanted": len(sweep.seeds),
             "tasks": counts[True].total(),
             "counts": dict(counts[True]),
             "prerequisite_counts": dict(counts[False]),

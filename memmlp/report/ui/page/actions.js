@@ -25,7 +25,7 @@ export function dialog(title, { field = null, value = '', lines = [], word = 'Sa
     await Promise.resolve().then(() => act(input?.value ?? '')).then(close, error => replace(trouble, error.message));
   };
   const box = h('dialog', { 'aria-label': title }, h('form', { onsubmit: submit }, h('h2', {}, title), lines.map(line => h('p', {}, line)), input, trouble,
-    h('div', { class: 'bar' }, h('button', { class: word === 'Delete' ? 'primary danger' : 'primary' }, word), word === 'Close' ? null : h('button', { type: 'button', onclick: close }, 'Cancel'))));
+    h('div', { class: 'bar' }, h('button', { class: 'primary', style: word === 'Delete' && '--accent: var(--bad)' }, word), word === 'Close' ? null : h('button', { type: 'button', onclick: close }, 'Cancel'))));
   box.addEventListener('cancel', () => box.remove());
   document.body.append(box);
   box.showModal();

@@ -19,10 +19,11 @@ function test(word) {
   if (!found) return run => run.text.includes(word.toLowerCase());
   const [, key, sign, wanted] = found;
   const values = reader(key);
+  if (!values) return Object.assign(() => sign === '!=', { unknown: key });
   return run => values(run).some(value => compare(value, sign, wanted)) !== (sign === '!=');
 }
 
-// A function that gives a run's values under a name, which may be the end of a dotted key.
+// A function that gives a run's values under a name, which may be the end of a dotted key; null for an unknown name.
 function reader(key) {
   if (key === 'tag' || key === 'tags') return run => run.tags;
   if (PLACES.includes(key)) return run => run.places.map(place => place[key]).filter(value => value !== undefined);
@@ -35,7 +36,7 @@ function reader(key) {
       if (name !== undefined) return run => [run[group][name]];
     }
   }
-  return () => [];
+  return null;
 }
 
 function compare(value, sign, wanted) {

@@ -29,7 +29,7 @@ function progress(sweep) {
   const before = words(sweep.prerequisite_counts);
   const text = `${words(sweep.counts)}${missing}${before ? `; prerequisites: ${before}` : ''}`;
   const remaining = sweep.remaining === null ? '' : ` · about ${duration(sweep.remaining)} remaining`;
-  return h('span', {}, h('progress', { value: sweep.share, max: 1, 'aria-label': 'done' }), ` ${Math.floor(100 * sweep.share)} % `, h('small', {}, `${text}${remaining}`));
+  return h('span', {}, h('progress', { value: sweep.share, max: 1, 'aria-label': 'done' }), ` ${Math.floor(100 * sweep.share)} %${sweep.wanted > sweep.seeds ? ` of ${sweep.seeds} of ${sweep.wanted} seeds, this round’s` : ''} `, h('small', {}, `${text}${remaining}`));
 }
 
 export async function single(name) {
@@ -41,7 +41,7 @@ export async function single(name) {
   const element = h('div', { class: 'page' }, top, ids.length ? section('Curves by variant', panel.element) : null, notes(sweep.table));
   function draw() {
     replace(top, h('p', { class: 'trail' }, link('#/sweeps', 'Sweeps')), h('div', { class: 'bar' }, h('h1', {}, sweep.table.caption)),
-      sweep.name === sweep.table.caption ? null : h('p', { class: 'faint' }, sweep.name), sweep.counts.done === sweep.tasks ? null : progress(sweep), again(sweep), sweep.cells.length ? board(sweep) : null,
+      sweep.name === sweep.table.caption ? null : h('p', { class: 'faint' }, sweep.name), sweep.counts.done === sweep.tasks && sweep.wanted <= sweep.seeds ? null : progress(sweep), again(sweep), sweep.cells.length ? board(sweep) : null,
       effects(sweep.table, draw), frontiers(sweep.table), section('Table', results(sweep.table)), sweep.rounds ? rounds(sweep.rounds) : null);
   }
   async function update() {
@@ -150,6 +150,10 @@ function frontiers(found) {
 
 const significant = effect => Boolean(effect) && effect.holm !== null && effect.holm < effect.level;
 
+const VERDICTS = { holds: 'Significant, with the paper’s sign', opposite: 'Significant, with the other sign than the paper’s', higher: 'Significant', lower: 'Significant', equivalent: 'Nearer to 0 than the smallest effect of interest',
+  inconclusive: 'Not decided: p is above the level, and the interval reaches beyond the smallest effect of interest; more seeds or persons may decide' };
+const verdictTitle = ({ verdict, holm, level }) => (verdict ? `${VERDICTS[verdict]} (${holm === null ? '' : `p ${number(Number(holm.toPrecision(2)))}, `}level ${number(Number(level.toPrecision(2)))}).` : '');
+
 // Seeds spent in rounds: what each interim analysis decided, and the progress of each variant.
 function rounds(found) {
   const decided = found.variants.reduce((sum, one) => sum + one.decided, 0);
@@ -161,7 +165,7 @@ function rounds(found) {
 }
 
 function results(found) {
-  const row = (one, mode) => [one.confounded ? `${one.label} ‡` : one.label, one.wanted.length ? `${one.found.length}/${one.wanted.length}` : 'paper', ...found.metrics.map(metric => h('td', { class: 'n' }, cell(one.cells[mode][metric], metric), otherBranches(one, mode, metric)))];
+  const row = (one, mode) => [[one.confounded ? `${one.label} ‡` : one.label, found.rows.some(other => other.against === one.label) && h('small', { class: 'faint' }, 'control')], one.wanted.length ? `${one.found.length}/${one.wanted.length}` : 'paper', ...found.metrics.map(metric => h('td', { class: 'n' }, cell(one.cells[mode][metric], metric), otherBranches(one, mode, metric)))];
   const heads = ['variant', 'seeds', ...found.metrics.map(metric => found.headings[metric])];
   return h('div', { class: 'stack' }, found.modes.map(mode => table(heads, found.rows.map(one => row(one, mode)), { kind: 'effects', scroll: 'scroll', file: `${found.name}-${mode}`, caption: found.modes.length > 1 ? `${mode} mode` : null })));
 }
@@ -170,7 +174,7 @@ function results(found) {
 function otherBranches(row, mode, metric) {
   const lines = Object.entries(row.branches ?? {}).map(([branch, modes]) => [branch, modes[mode]?.[metric]]).filter(([, effect]) => effect);
   const digits = effect => effectDigits({ ...effect, value: row.cells[mode][metric].mean });
-  return lines.map(([branch, effect]) => h('small', { class: 'faint branch' }, `${branch} ${signed(effect.mean, digits(effect))}${effect.verdict ? ` ${effect.verdict}` : ''}`));
+  return lines.map(([branch, effect]) => h('small', { class: 'faint branch', title: `Variant and control in the ${branch} branch. ${verdictTitle(effect)}` }, `${branch} ${signed(effect.mean, digits(effect))}${effect.verdict ? ` ${effect.verdict}` : ''}`));
 }
 
 function cell({ mean, sd, effect, paper, paper_effect: paperEffect, counted, clips }, metric) {
@@ -178,9 +182,9 @@ function cell({ mean, sd, effect, paper, paper_effect: paperEffect, counted, cli
   return [
     h('span', { class: 'strong' }, mean === null ? DASH : metricNumber(metric, mean), sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(sd, mean >= 1000 ? 0 : decimals(mean))}`), counted < clips ? h('small', { class: 'faint' }, ` (${counted} of ${clips} clips)`) : null),
     effect && h('span', { class: significant(effect) ? 'strong' : '' }, signed(effect.mean, digits), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`)),
-    effect?.verdict && [h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null,
+    effect?.verdict && [h('span', { class: `verdict ${effect.verdict}`, title: verdictTitle(effect) }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null,
       effect.holm === null || !(effect.groups <= 30) ? null : h('small', { class: 'faint' }, ` p ${number(Number(effect.holm.toPrecision(2)))}`),
-      effect.bootstrap == null ? null : h('small', { class: 'faint' }, ` bootstrap ${number(Number(effect.bootstrap.toPrecision(2)))}`)],
+      effect.bootstrap == null ? null : h('small', { class: 'faint', title: 'The same p by a bootstrap, as a check; the verdict does not use it' }, ` bootstrap ${number(Number(effect.bootstrap.toPrecision(2)))}`)],
     paper !== null && h('small', { class: 'faint' }, `paper ${number(paper)}`, paperEffect === null ? null : ` (${signed(paperEffect)})`),
   ];
 }
