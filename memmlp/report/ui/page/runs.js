@@ -1,7 +1,7 @@
 // The table of runs: filter, sort, the columns in which they differ, tags and notes; and chosen runs with their curves.
 
 import { download, h, replace, link, savePng, section, select, empty, say, toCsv } from './dom.js';
-import { about, address, ask, inFile, nameOf, place, remember, runs } from './store.js';
+import { about, address, ask, dataName, inFile, nameOf, place, remember, runs } from './store.js';
 import { parse, matches } from './filter.js';
 import { curvePanel } from './curves.js';
 import { button, buttons, canChange, change, command, dialog } from './actions.js';
@@ -57,7 +57,7 @@ export async function page(name, route) {
   const dataSets = h('p', { class: 'best' });
   const table = h('table', { class: 'runs' });
   const more = h('button', { type: 'button', onclick: () => { ui.drawn += STEP * 4; body(); } });
-  const compare = h('button', { type: 'button', class: 'primary', title: 'Choose runs in the first column', onclick: () => { location.hash = address('compare', '', { runs: place().query.get('sel') }); } });
+  const compare = h('button', { type: 'button', class: 'primary', title: 'Choose two runs or more in the first column', onclick: () => { location.hash = address('compare', '', { runs: place().query.get('sel') }); } });
   const set = changes => { remember(changes); draw(); };
   const filter = h('input', {
     type: 'search', id: 'filter', spellcheck: false, autocomplete: 'off', placeholder: 'memory=gru stream.MPJPE<6.3, or words',
@@ -66,8 +66,7 @@ export async function page(name, route) {
   const scroll = h('div', { class: 'scroll tall' }, table, more);
   const [nothing, happening, tools, picked, plot, lines] = Array.from({ length: 6 }, () => h('div'));
   const remarks = h('p', { class: 'faint' });
-  picked.className = 'picked';
-
+  Object.assign(picked, { className: 'picked', style: 'min-height: 1.75rem' }); // the table stays where it is at the first choice
   function draw(live = false) { // live: without touching what somebody uses
     const inUse = part => live && part.contains(document.activeElement);
     const { query } = place();
@@ -95,15 +94,16 @@ export async function page(name, route) {
     const hidden = archived ? 0 : [...runs.values()].filter(run => run.archived).length;
     const count = name => ui.list.filter(run => run.status === name).length;
     replace(counted, [`${number(ui.list.length)} of ${number(runs.size)} runs`, ...STATES.filter(count).map(name => `${number(count(name))} ${STATE_WORDS[name] ?? name}`)].join(', '), hidden ? [', ', link(address('runs', '', { filter: 'archived=true' }), `${hidden} archived`)] : null);
-    replace(dataSets, ui.data.length > 1 ? `On ${ui.data.length} data sets, whose errors are not comparable; filter by one: ${ui.data.slice(0, 5).map(data => `data=${data}`).join(', ')}` : null);
+    const named = data => dataName(data).split(' ')[0]; // a digest only where a name has several
+    const names = ui.data.map(data => `data=${ui.data.some(other => other !== data && named(other) === named(data)) ? data : named(data)}`);
+    replace(dataSets, tests.filter(one => one.unknown).map(one => `${one.unknown}: no key in which runs differ. `), names.length > 1 ? [`On ${names.length} data sets, whose errors are not comparable; filter by one: `, names.slice(0, 5).flatMap(one => [' ', button(one, () => set({ filter: `${settings.text} ${one}`.trim() }))])] : null);
     replace(happening, now());
     const marks = [...new Set(ui.list.slice(0, ui.drawn).flatMap(run => Object.values(run.marks)).map(text => text.replace(/ \(.*?\)|: a core.*/, '')))];
     replace(remarks, marks.length ? `* ${marks.join('; ')}` : null);
-    scroll.hidden = tools.hidden = !ui.list.length;
+    scroll.hidden = tools.hidden = picked.hidden = !ui.list.length;
     replace(nothing, ui.list.length ? null : runs.size ? empty('No run matches.', h('button', { type: 'button', onclick: () => set({ filter: '' }) }, 'Show all runs'))
       : empty('There are no runs yet.', h('p', {}, 'They appear here as soon as one starts:'), command('memmlp demo'), command('memmlp train data=synth profile=tiny'), h('p', { class: 'faint' }, `Searched in: ${about.outputs}/runs`)));
   }
-
   // Groups, columns, baseline, saved views and CSV.
   function toolbar(query, pinned, group) {
     const names = [...about.keys, ...about.metrics].filter(one => !pinned.includes(one)).map(one => [one, one]);
@@ -123,9 +123,7 @@ export async function page(name, route) {
       button('CSV', () => download('runs.csv', toCsv(whole())), 'All rows and shown columns'), button('PNG', () => savePng('runs.png', table), 'The rows shown'),
       h('div', { class: 'chips' }, pinned.map(one => button(`${one} ×`, () => pin(pinned.filter(other => other !== one)), 'Unpin')), ui.base ? button(`Baseline: ${ui.base.name} ×`, () => set({ base: '' })) : null));
   }
-
   const whole = () => h('table', {}, table.tHead.cloneNode(true), h('tbody', {}, ui.list.map(run => line(run, {}))));
-
   function scatterOf(query) {
     const [x, y] = [query.get('x') || about.keys.find(key => key !== 'seed' && ui.list.some(run => typeof run.config[key] === 'number')) || about.metrics[0], query.get('y')];
     if (!y || !about.metrics.includes(y)) { ui.plotted = ''; return replace(plot); }
@@ -137,7 +135,6 @@ export async function page(name, route) {
     return replace(plot, section('Scatter', h('div', { class: 'tools' }, select('Horizontal', [...about.keys, ...about.metrics].map(one => [one, one]), x, value => set({ x: value }))),
       points.length ? scatter(points, { x, y: metricText(y), mark: 'baseline', joined: false, open: point => { location.hash = address('run', point.run.id); } }) : h('p', { class: 'faint' }, 'No run has both.')));
   }
-
   function axesOf(query) {
     const rows = query.get('axes') ? ui.list.slice(0, 500).map(run => ({ id: run.id, text: nameOf(run), values: { ...run.config, ...run.metrics } })) : [];
     const axes = [...ui.columns].sort((a, b) => about.metrics.includes(a) - about.metrics.includes(b)).slice(0, 9);
@@ -146,7 +143,6 @@ export async function page(name, route) {
     ui.axes = key;
     replace(lines, rows.length && axes.length > 1 ? section('Parallel axes', parallel(rows, axes, { open: row => { location.hash = address('run', row.id); } })) : null);
   }
-
   function head(sort) {
     const short = shortKeys(ui.columns.filter(name => about.keys.includes(name)));
     const startsDown = name => name === 'started' || name === 'seconds' || better(name) === 'higher';
@@ -163,7 +159,6 @@ export async function page(name, route) {
     const heads = ui.columns.map(name => (about.keys.includes(name) ? cell(name, short.get(name), { title: name, 'data-csv': name }) : metric(name)));
     replace(table.tHead ?? table.createTHead(), h('tr', {}, h('th', { scope: 'col', class: 'pick' }, all), cell('name', 'run'), cell('status', 'status'), heads, cell('started', 'started', { class: 'n' }), cell('seconds', 'took', { class: 'n' })));
   }
-
   function pick(list, on) {
     for (const run of list) on ? chosen.add(run.id) : chosen.delete(run.id);
     body();
@@ -221,9 +216,9 @@ export async function page(name, route) {
     const ids = [...chosen].filter(id => runs.has(id)).slice(0, 60);
     remember({ sel: ids.join(',') });
     compare.textContent = ids.length ? `Compare ${ids.length}` : 'Compare';
-    compare.disabled = !ids.length;
-    const done = deleted => { if (deleted) chosen.clear(); draw(); };
-    replace(picked, ids.length ? [h('span', { class: 'count' }, `${ids.length} chosen:`), buttons(ids, done), ids.length === 1 ? button('Baseline', () => set({ base: ids[0] }), 'Show differences from this run') : null] : null);
+    compare.disabled = ids.length < 2;
+    const done = deleted => { for (const id of ids) if (deleted || runs.get(id)?.archived) chosen.delete(id); draw(); };
+    replace(picked, ids.length ? [h('span', { class: 'count' }, `${ids.length} chosen:`), buttons(ids, done), h('button', { type: 'button', class: 'small', disabled: ids.length > 1, title: ids.length > 1 ? 'Choose one run' : 'Show differences from this run', onclick: () => set({ base: ids[0] }) }, 'Baseline')] : h('span', { class: 'count' }, 'No run chosen'));
     for (const row of table.tBodies[0]?.rows ?? []) row.classList.toggle('chosen', chosen.has(row.querySelector('input').dataset.run));
   }
 
