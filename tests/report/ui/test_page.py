@@ -271,7 +271,9 @@ def test_daily_work_groups_baseline_csv_and_changes(browser: Browser, tmp_path: 
     new = started_run(tmp_path)
     gru, none = (run_of(tmp_path, variant, 0) for variant in ("gru", "none"))
     with RunsServer(Answers(tmp_path, predict, 0.05), 0) as running:
-        go(browser, running.url, f"runs?by=variant&base={none.id}&axes=yes", f"{count('.group')} == 3")
+        go(browser, running.url, f"runs?by=variant&sel={none.id}&axes=yes", f"{count('.group')} == 3")
+        browser.value(PRESS.format(".picked", "Baseline"))
+        browser.wait(f"location.hash.includes('base={none.id}')")
         (group,) = (row for row in browser.value(texts(".runs tbody tr")) if "mine: gru" in row)
         assert "3 runs" in group
         assert re.search(r"5\.\d\d ± 0\.0\d\N{MINUS SIGN}1\.3", group)
