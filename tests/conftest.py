@@ -96,11 +96,14 @@ def _no_process_is_left() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _parse_once() -> None:
-    """OmegaConf parses each `${seed}` again, and Hydra each override thrice: most of a composition."""
+    """OmegaConf parses each `${seed}` again, and Hydra each override thrice: most of a composition. Each
+    export parses the code of 500 operators: a third of its time."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
+    from torch.onnx._internal._lazy_import import onnxscript_apis
 
     omegaconf.base.parse = functools.lru_cache(maxsize=1000)(omegaconf.base.parse)
     parse = functools.lru_cache(maxsize=9000)(OverridesParser.create().parse_rule)
+    onnxscript_apis.get_torchlib_ops = functools.lru_cache(onnxscript_apis.get_torchlib_ops)
     OverridesParser.parse_rule = lambda self, text, rule: copy.copy(parse(text, rule))
 
 

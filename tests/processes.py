@@ -19,7 +19,7 @@ PATIENCE = 900.0  # seconds until a wait fails, even on a very busy machine
 SERVERS = (b"multiprocessing.resource_tracker", b"multiprocessing.forkserver")  # they end with this process
 PRELOADED = [
     "memmlp.cli.main", "memmlp.config.build", "memmlp.training.run_stages", "memmlp.deploy.export",
-    "torch._dynamo", "scipy.interpolate",
+    "torch._dynamo", "scipy.interpolate", "digested",
 ]  # fmt: skip
 
 

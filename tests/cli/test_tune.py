@@ -4,11 +4,13 @@ import csv
 import re
 import shlex
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
-from command_line import BRIEF, run_apart
+from command_line import BRIEF, in_folder, run_apart
 from command_line import run as command
+from processes import forked, until
 
 from benchmarks.chaos import examine, wait_for_release
 from memmlp.cli.tune import prepare_search, search
@@ -21,16 +23,31 @@ from memmlp.sweep.search.search_file import Range
 from memmlp.sweep.search.study import Study
 
 TINY = [*BRIEF, "optim.validate_every=3"]
-TRIALS = ["memory=none", "search.n_trials=2", "search.seeds=2"]
+TFLOP = 2e-5
+TRIALS = ["memory=none", "search.n_trials=2", "search.seeds=2", f"search.tflop={TFLOP}"]
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run a search of two trials, each of two seeds, in a folder of its own."""
+    """Run a search of two trials, each of two seeds. Its controller is killed during the second trial."""
     folder = tmp_path_factory.mktemp("tune")
-    (folder / "said.txt").write_text(run_apart(folder, "tune", *TINY, *TRIALS, "--workers", "1"))
+    words = ["tune", *TINY, *TRIALS, "--workers", "1"]
+    with forked(in_folder, folder, *words) as process:
+        until(lambda: count_trials(folder) == 2, "the second trial", process)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+    (folder / "said.txt").write_text(run_apart(folder, *words))
     wait_for_release(folder / "outputs")
     return folder
+
+
+def view(home: Path) -> Study | None:
+    setup = prepare_search([*TINY, *TRIALS], None, home / "outputs")
+    return Study.view(setup.search, setup.folder.name, setup.folder)
+
+
+def count_trials(home: Path) -> int:
+    return len(study.trials) if (study := view(home)) else 0
 
 
 def read_trials(folder: Path) -> list[dict[str, str]]:
@@ -52,10 +69,18 @@ def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
     best = min(rows, key=lambda row: float(row["MPJPE"]))
     assert f"{float(best['MPJPE']):.3f} ± {float(best['MPJPE sd']):.3f}" in said
     first, second = best["run"].split()
-    assert Run.from_id(home / "outputs", second).config["seed"] == 1
+    run = Run.from_id(home / "outputs", second)
+    assert (run.config["seed"], run.manifest["tflop"]) == (1, pytest.approx(TFLOP, rel=0.05))
     (words,) = re.findall(r"next: memmlp (.*)", said)
     assert f"outputs/runs/{first}" in command(home, *shlex.split(words), "export.graph=off")
     assert len(list((home / "outputs/runs").iterdir())) == 4  # none was repeated
+
+
+def test_a_killed_search_has_the_trials_of_an_undisturbed_one(home: Path, tmp_path: Path):
+    study = view(home)
+    assert study is not None
+    undisturbed = Study.open(study.search, "undisturbed", tmp_path)
+    assert [trial.params for trial in study.trials] == [undisturbed.ask().params for _ in range(2)]
 
 
 def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
@@ -69,7 +94,8 @@ def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
 def test_searches_of_one_and_of_two_seeds_share_the_first_seeds_runs(home: Path, tmp_path: Path):
     for name in ("runs", "data", "cache"):
         shutil.copytree(home / "outputs" / name, tmp_path / "outputs" / name, copy_function=shutil.copy2)
-    said = command(tmp_path, "tune", *TINY, "memory=none", "search.n_trials=1", "--workers", "1")
+    words = [*TINY, *TRIALS, "search.n_trials=1", "search.seeds=1"]
+    said = command(tmp_path, "tune", *words, "--workers", "1")
     assert "1 of 1 trials: 1 complete" in said
     (row,), two = read_trials(folder_of(tmp_path)), read_trials(folder_of(home))[0]
     assert (row["run"], row["MPJPE"]) == (two["run"].split()[0], two["MPJPE, run 1"])

@@ -1,4 +1,7 @@
-"""Processes killed at arbitrary moments: a training, a sweep and a search end as undisturbed ones do."""
+"""Processes killed at arbitrary moments: a training, a sweep and a search end as undisturbed ones do.
+
+A search killed once: tests/cli/test_tune.py.
+"""
 
 import json
 import random
@@ -8,16 +11,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from command_line import BRIEF, SMALL, in_folder, run, run_apart
+from command_line import BRIEF, SMALL, in_folder, run
 from processes import Forked, forked, until
 
 from benchmarks import chaos, nasty_names
-from memmlp.cli.tune import SearchSetup, prepare_search
 from memmlp.common.lease import current_process
 from memmlp.networks import checkpoint
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
-from memmlp.sweep.search.study import Study, journal_path
 
 
 def last_step(outputs: Path) -> int:
@@ -35,6 +36,7 @@ MOMENTS = {
 @pytest.mark.slow
 def test_a_killed_training_resumes_to_the_same_model(tmp_path: Path):
     words = ["train", *BRIEF, "optim.steps=40", "optim.checkpoint_every=5", "export.graph=off"]
+    words += ["evaluation.modes=[stream]"]
     disturbed, whole = tmp_path / "disturbed", tmp_path / "whole"
     for folder in (disturbed, whole):
         folder.mkdir()
@@ -45,7 +47,7 @@ def test_a_killed_training_resumes_to_the_same_model(tmp_path: Path):
             assert process.wait() == -signal.SIGKILL
     for folder in (disturbed, whole):
         run(folder, *words)
-    (expected,) = (made for made in list_runs(whole / "outputs") if "window" in made.results)
+    (expected,) = (made for made in list_runs(whole / "outputs") if "stream" in made.results)
     killed = Run.from_id(disturbed / "outputs", expected.id)
     assert killed.done
     assert killed.model.read_bytes() == expected.model.read_bytes()
@@ -116,29 +118,3 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
         f"run {'d' * 16}: is still held", f"run {'e' * 16}: artifact model.safetensors is missing or changed",
         f"run {'e' * 16}: other weights", f"run {'f' * 16} should not be",
     ]  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_killed_search_has_the_trials_of_an_undisturbed_one(tmp_path: Path):
-    """The controller of a search of fixed compute is killed during the second of two trials."""
-    small = ["profile=tiny", "data.synth.minutes=0.05", "loggers=none", "threads=1", "model=avatar_poser"]
-    words = [*small, "search=budget", "search.n_trials=2", "search.tflop=0.0006"]
-    setup = prepare_search(words, None, tmp_path / "outputs")
-    with forked(in_folder, tmp_path, "tune", *words, "--workers", "1") as process:
-        journal = journal_path(setup.folder)
-        until(lambda: journal.exists() and len(view(setup).trials) == 2, "the second trial", process)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-    run_apart(tmp_path, "tune", *words, "--workers", "1")
-    undisturbed = Study.open(setup.search, "undisturbed", tmp_path)
-    expected = [undisturbed.ask().params for _ in range(2)]
-    assert [trial.params for trial in view(setup).trials] == expected
-    runs = [Run.from_id(tmp_path / "outputs", *trial.user_attrs["runs"]) for trial in view(setup).trials]
-    assert [run.manifest["tflop"] for run in runs] == pytest.approx([0.0006] * 2, rel=0.05)
-    assert len({run.id for run in runs}) == 2
-
-
-def view(setup: SearchSetup) -> Study:
-    study = Study.view(setup.search, setup.folder.name, setup.folder)
-    assert study is not None
-    return study
