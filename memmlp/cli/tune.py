@@ -15,7 +15,7 @@ from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
 from memmlp.common.overrides import Override
-from memmlp.common.text_formats import escape_interpolations, join_command
+from memmlp.common.text_formats import join_command
 
 if TYPE_CHECKING:
     from memmlp.sweep.plan import RunTask
@@ -174,16 +174,12 @@ def _make_tasks(setup: SearchSetup, values: Mapping[str, Value]) -> list[Sequenc
 
 
 def _make_requests(setup: SearchSetup, values: Mapping[str, Value]) -> list[RunRequest]:
-    from memmlp.config.build_request import build_request
-    from memmlp.config.compose import compose_config
+    from memmlp.config.build_request import build_requests
+    from memmlp.config.compose import compose_checked
 
-    cfg = compose_config([*setup.config_options, *setup.list_overrides(values)])
-    cfg.paths.outputs = escape_interpolations(str(setup.outputs))
-    first, found = cfg.seed, []
-    for number in range(setup.search.seeds):
-        cfg.seed = first + number
-        found.append(build_request(cfg))
-    return found
+    checked = compose_checked([*setup.config_options, *setup.list_overrides(values)])
+    first = checked.resolved["seed"]
+    return list(build_requests(checked, setup.outputs, range(first, first + setup.search.seeds)))
 
 
 def show(setup: SearchSetup) -> None:

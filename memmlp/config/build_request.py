@@ -3,7 +3,8 @@
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -13,7 +14,9 @@ from memmlp.common.components import Component, component, find_component
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import flatten
 from memmlp.common.settings import Settings, at_least, positive, setting
+from memmlp.common.text_formats import escape_interpolations
 from memmlp.config import plugins
+from memmlp.config.check import CheckedConfig
 from memmlp.motion.clip import LINES
 from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.cache import ClipFolder
@@ -25,26 +28,30 @@ from memmlp.training.request import RunRequest
 SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit, "persons": PersonSplit}
 
 
-def build_motion(cfg: DictConfig) -> MotionSource:
-    """Build the source of an experiment's motion. The name of a synthetic folder contains the generator's
-    settings and its component version above 1, so different ones use different folders. Raises InputError if
-    a list of groups cannot be read, two folders have the same name, or the generator does not exist."""
-    data = cfg.data
+def build_motion(config: Mapping[str, Any]) -> MotionSource:
+    """Build the source of an experiment's motion from a resolved config. The name of a synthetic folder
+    contains the generator's settings and its component version above 1, so different ones use different
+    folders. Raises InputError if a list of groups cannot be read, two folders have the same name, or the
+    generator does not exist."""
+    data = config["data"]
     root, split = _build_clip_request(data)
     generate: Callable[[Path], object] | None = None
-    if data.synth is not None:
-        settings = {str(key): value for key, value in data.synth.items() if key != "name"}
-        generator = find_component("generator", data.synth.name)
+    if data["synth"] is not None:
+        settings = {key: value for key, value in data["synth"].items() if key != "name"}
+        generator = find_component("generator", data["synth"]["name"])
         folder = "-".join([generator.name, *(f"{key}{value}" for key, value in settings.items())])
         folder = folder.replace("/", "_")  # a setting must not choose another folder
         if generator.name == "puppet":
-            folder = f"{data.synth.minutes:g}min-seed{data.synth.seed}"
+            folder = f"{settings['minutes']:g}min-seed{settings['seed']}"
         version = f"-v{generator.version}" if generator.version > 1 else ""
-        root, generate = Path(data.root) / f"{folder}{version}", partial(_run_generator, generator, settings)
+        root, generate = (
+            Path(data["root"]) / f"{folder}{version}",
+            partial(_run_generator, generator, settings),
+        )
 
     interpolation = data.get("interpolation", LINES)  # old configs without the key used lines
-    clips = ClipFolder(root, split, str(data.body), data.min_frames, data.strict, interpolation)
-    caches = Path(cfg.paths.outputs) / "cache"
+    clips = ClipFolder(root, split, str(data["body"]), data["min_frames"], data["strict"], interpolation)
+    caches = Path(config["paths"]["outputs"]) / "cache"
     return MotionSource(clips, generate, caches, partial=data.get("partial", False))
 
 
@@ -79,25 +86,25 @@ class _ClipRequest(NamedTuple):
     split: Split
 
 
-def _build_clip_request(data: DictConfig) -> _ClipRequest:
+def _build_clip_request(data: Mapping[str, Any]) -> _ClipRequest:
     """Return the folders and the split of the config. Each source has a separate split."""
-    keys: dict[str, Any] = OmegaConf.to_container(data.split, resolve=True)  # type: ignore[assignment]
+    keys = copy.deepcopy(data["split"])
     if "kinds" in keys:
         keys["kinds"] = {name: Kind(**kind) for name, kind in keys["kinds"].items()}
     split: Any = SPLITS[keys.pop("name")](**keys)
     if sources := data.get("sources"):
-        folders = NamedFolders({name: Path(source.root) for name, source in sources.items()})
+        folders = NamedFolders({name: Path(source["root"]) for name, source in sources.items()})
         splits = {name: _build_source_split(split, name, source) for name, source in sources.items()}
         return _ClipRequest(folders, MixedSplit(splits))
-    roots = list(data.root) if OmegaConf.is_list(data.root) else [data.root]
+    roots = data["root"] if isinstance(data["root"], list) else [data["root"]]
     if len(roots) == 1:
         return _ClipRequest(Path(roots[0]), split)
     folders = NamedFolders.from_paths([Path(root) for root in roots])
     return _ClipRequest(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
 
 
-def _build_source_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
-    fractions = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
+def _build_source_split(split: SeededSplit, name: str, source: Mapping[str, Any]) -> SeededSplit:
+    fractions: Any = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
     groups = [*split.groups, *(source.get("groups") or ())]
     try:
         return replace(split, groups=groups, groups_file=source.get("groups_file"), **fractions)
@@ -110,25 +117,35 @@ def build_request(cfg: DictConfig) -> RunRequest:
     or the motion source cannot be built."""
     config = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
     config["plugins"] = plugins.find_used_packages(config)
-    return RunRequest(config, build_motion(cfg))
+    return RunRequest(config, build_motion(config))
 
 
-def build_requests(cfg: DictConfig, seeds: Sequence[int]) -> Iterator[RunRequest]:
-    """Yield the run request of a checked config for each seed. Resolving is slow, so only the seed, and keys
-    that refer to it, are resolved again for later seeds."""
-    cfg.seed = seeds[0]
-    first = build_request(cfg)
-    yield first
-    raw = flatten(cast(dict[str, Any], OmegaConf.to_container(cfg)))
-    keys = ["seed", *(key for key, value in raw.items() if "${" in str(value) and "seed" in str(value))]
-    for seed in seeds[1:]:
-        cfg.seed = seed
-        config = copy.deepcopy(first.config)
+def build_requests(checked: CheckedConfig, outputs: Path, seeds: Sequence[int]) -> Iterator[RunRequest]:
+    """Yield the run request of a config in an outputs folder for each seed. Resolving is slow, so only these
+    keys, and keys that refer to them, are resolved again."""
+    cfg, config = checked
+    config = {**config, "plugins": plugins.find_used_packages(config)}
+    cfg.paths.outputs = escape_interpolations(str(outputs))
+    keys = _list_dependents(cfg, "paths.outputs", "seed")
+    same_motion = not any(key.startswith("data.") for key in _list_dependents(cfg, "seed"))
+    motion = None
+    for seed in seeds:
+        cfg.seed, config = seed, copy.deepcopy(config)
         for key in keys:
             *groups, last = key.split(".")
-            tree = config
-            for group in groups:
-                tree = tree[group]
-            tree[last] = OmegaConf.select(cfg, key)
-        same_motion = not any(key.startswith("data.") for key in keys)
-        yield replace(first, config=config) if same_motion else build_request(cfg)
+            value = OmegaConf.select(cfg, key)
+            plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+            reduce(getitem, groups, config)[last] = plain
+        motion = motion if motion and same_motion else build_motion(config)
+        yield RunRequest(config, motion)
+
+
+def _list_dependents(cfg: DictConfig, *changed: str) -> list[str]:
+    """Return these dotted keys and all keys that may refer to them, directly or not."""
+    raw = flatten(cast(dict[str, Any], OmegaConf.to_container(cfg)))
+    texts = {key: str(value) for key, value in raw.items() if "${" in str(value)}
+    found, before = set(changed), set[str]()
+    while found != before:
+        before, parts = set(found), {part for key in found for part in key.split(".")}
+        found |= {key for key, text in texts.items() if any(part in text for part in parts)}
+    return sorted(found)

@@ -3,12 +3,12 @@
 import dataclasses
 import difflib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, Union, cast, get_args, get_origin, get_type_hints
 
 from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
@@ -20,45 +20,73 @@ from omegaconf.errors import (
 
 from memmlp.common.components import SLOTS, find_chosen_settings
 from memmlp.common.errors import InputError
+from memmlp.common.overrides import flatten
+from memmlp.common.settings import Rule
 from memmlp.common.text_formats import join_command, make_override
 from memmlp.config.schema import Config
 
 
-def check(cfg: DictConfig) -> None:
+class CheckedConfig(NamedTuple):
+    """A composed config, and the same as plain dictionaries with resolved interpolations."""
+
+    cfg: DictConfig
+    resolved: dict[str, Any]
+
+
+def check(cfg: DictConfig) -> CheckedConfig:
     """Check a composed config. Raises InputError for a missing or unknown key, an invalid value, or values
     that cannot be combined."""
     if OmegaConf.get_type(cfg) is not Config:
         raise InputError("config: must start from /schema/config, as conf/train.yaml does")
-    for name, value, rule in _list_values(cfg, ""):
+    config = _resolve(cfg)
+    for name, value, rule in _list_values(cfg, config, ""):
+        if value == MISSING:
+            raise _make_missing_error(name)
         if rule is not None and value is not None and not rule.allows(value):
-            shown = list(value) if OmegaConf.is_list(value) else value
-            raise InputError(f"{name}={shown}: must be {rule.words}")
+            raise InputError(f"{name}={value}: must be {rule.words}")
     for slot in SLOTS:
-        for problem in settings.problems(cfg) if (settings := find_chosen_settings(cfg, slot)) else ():
+        for problem in settings.problems(config) if (settings := find_chosen_settings(config, slot)) else ():
             raise InputError(problem)
-    for problem in _find_problems(cfg):
+    for problem in _find_problems(config):
         raise InputError(problem)
+    return CheckedConfig(cfg, config)
 
 
-def _list_values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the dotted name, value and rule of each key in a typed node and its groups. Raises InputError for
-    a key that is not in the schema."""
+def _resolve(cfg: DictConfig) -> dict[str, Any]:
+    try:
+        return cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
+    except OmegaConfBaseException:
+        for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(cfg))).items():
+            if value == MISSING:
+                raise _make_missing_error(name) from None
+            try:
+                OmegaConf.select(cfg, name)
+            except OmegaConfBaseException as error:
+                raise InputError(f"{name}: {str(error).splitlines()[0]}") from None
+        raise
+
+
+def _make_missing_error(name: str) -> InputError:
+    return InputError(f"{name}: has no value; set {name}=VALUE")
+
+
+def _list_values(
+    node: DictConfig, values: Mapping[str, Any], prefix: str
+) -> Iterator[tuple[str, Any, Rule | None]]:
+    """Yield the dotted name, value and rule of each key in a typed node, given with its resolved values, and
+    in its groups. Raises InputError for a key that is not in the schema."""
     schema: Any = OmegaConf.get_type(node)
-    if not dataclasses.is_dataclass(schema):  # a dictionary of groups, or of values
-        for name in map(str, node):
-            if isinstance(node[name], DictConfig):
-                yield from _list_values(node[name], f"{prefix}{name}.")
-        return
-    keys = [spec.name for spec in dataclasses.fields(schema)]
-    for extra in sorted(set(map(str, node)) - set(keys)):
-        raise InputError(describe_unknown_key(prefix + extra, keys))
-    for spec in dataclasses.fields(schema):
-        name = prefix + spec.name
-        value = _read_value(node, spec.name, name)
-        if isinstance(value, DictConfig):
-            yield from _list_values(value, f"{name}.")
+    if dataclasses.is_dataclass(schema):
+        rules = {spec.name: spec.metadata.get("rule") for spec in dataclasses.fields(schema)}
+        for extra in sorted(set(map(str, values)) - set(rules)):
+            raise InputError(describe_unknown_key(prefix + extra, list(rules)))
+    else:  # a dictionary of groups, or of values
+        rules = {name: None for name, value in values.items() if isinstance(value, dict)}
+    for name, rule in rules.items():
+        if isinstance(values[name], dict):
+            yield from _list_values(node[name], values[name], f"{prefix}{name}.")
         else:
-            yield name, value, spec.metadata.get("rule")
+            yield f"{prefix}{name}", values[name], rule
 
 
 def describe_unknown_key(name: str, keys: Sequence[str]) -> str:
@@ -70,48 +98,41 @@ def describe_unknown_key(name: str, keys: Sequence[str]) -> str:
     return f"{name}: no such key; {hint}{expected}"
 
 
-def _read_value(node: DictConfig, own: str, name: str) -> Any:
-    if OmegaConf.is_missing(node, own):
-        raise InputError(f"{name}: has no value; set {name}=VALUE")
-    try:
-        return node[own]
-    except OmegaConfBaseException as error:
-        raise InputError(f"{name}: {str(error).splitlines()[0]}") from None
-
-
-def _find_problems(cfg: DictConfig) -> Iterator[str]:
+def _find_problems(config: Mapping[str, Any]) -> Iterator[str]:
     """Yield an error line for values that cannot be combined. Components check their own keys."""
-    for name, node in cfg.loggers.items():
-        if node.name != name:
-            yield f"loggers.{name}.name={node.name}: must be {name}, the name of its key"
-    if "streams" in cfg.rollout and cfg.rollout.streams < cfg.optim.batch:
-        yield f"rollout.streams={cfg.rollout.streams}: must be at least optim.batch={cfg.optim.batch}"
-    if (cfg.vqvae.epochs is None) == (cfg.vqvae.steps is None):
-        values = f"vqvae.epochs={cfg.vqvae.epochs}, vqvae.steps={cfg.vqvae.steps}"
+    for name, logger in config["loggers"].items():
+        if logger["name"] != name:
+            yield f"loggers.{name}.name={logger['name']}: must be {name}, the name of its key"
+    rollout, batch = config["rollout"], config["optim"]["batch"]
+    if "streams" in rollout and rollout["streams"] < batch:
+        yield f"rollout.streams={rollout['streams']}: must be at least optim.batch={batch}"
+    epochs, steps = config["vqvae"]["epochs"], config["vqvae"]["steps"]
+    if (epochs is None) == (steps is None):
+        values = f"vqvae.epochs={epochs}, vqvae.steps={steps}"
         yield f"{values}: one key must be null, and the other key must be a number"
-    yield from _find_data_problems(cfg.data)
-    precision = f"export.precision={cfg.export.precision}: must be fp32"
-    if cfg.export.precision != "fp32" and cfg.export.graph in ("naive", "off"):
-        yield f"{precision} with export.graph={cfg.export.graph}; lower precisions need the streaming graph"
-    if cfg.export.precision != "fp32" and cfg.memory is not None and cfg.memory.get("history") == "latest":
+    yield from _find_data_problems(config["data"])
+    export, memory = config["export"], config["memory"] or {}
+    precision = f"export.precision={export['precision']}: must be fp32"
+    if export["precision"] != "fp32" and export["graph"] in ("naive", "off"):
+        yield f"{precision} with export.graph={export['graph']}; lower precisions need the streaming graph"
+    if export["precision"] != "fp32" and memory.get("history") == "latest":
         yield f"{precision} with memory.history=latest, which has no streaming graph"
 
 
-def _find_data_problems(data: DictConfig) -> Iterator[str]:
-    sources = data.get("sources") or {}
-    if (data.root is None) == (not sources):
-        yield f"data.root={data.root}: must be a folder or a list of folders, or null with data.sources"
+def _find_data_problems(data: Mapping[str, Any]) -> Iterator[str]:
+    sources, root, split = data.get("sources") or {}, data["root"], data["split"]
+    if (root is None) == (not sources):
+        yield f"data.root={root}: must be a folder or a list of folders, or null with data.sources"
     if bad := [name for name in map(str, sources) if not re.fullmatch(r"[\w-]+", name)]:
         yield f"data.sources.{bad[0]}: expected a name with only letters, digits, - and _"
-    weights = [source.weight for source in sources.values()]
+    weights = [source["weight"] for source in sources.values()]
     if any(weights) and not all(weights):
         yield "data.sources: expected a weight for every source, or no weights"
-    if (sources or OmegaConf.is_list(data.root)) and data.split.get("groups_file") is not None:
+    if (sources or isinstance(root, list)) and split.get("groups_file") is not None:
         yield "data.split.groups_file: must be null with several folders; set data.sources.NAME.groups_file"
-    split = data.split
-    held_out = split.get("val", 0) + (split.test if isinstance(split.get("test"), float) else 0)
+    held_out = split.get("val", 0) + (split["test"] if isinstance(split.get("test"), float) else 0)
     if held_out >= 1:
-        yield f"data.split.val={split.val}: must be below 1 in sum with data.split.test"
+        yield f"data.split.val={split['val']}: must be below 1 in sum with data.split.test"
 
 
 SOURCES = "data.sources"

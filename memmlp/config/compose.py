@@ -7,7 +7,7 @@ import itertools
 import os
 import pickle
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, NoReturn, cast
@@ -31,7 +31,7 @@ from memmlp.common.schema import parse_config_yaml
 from memmlp.common.settings import Settings
 from memmlp.common.text_formats import join_command, keep_text, make_override
 from memmlp.config import plugins
-from memmlp.config.check import check, describe_unknown_key, explain_error
+from memmlp.config.check import CheckedConfig, check, describe_unknown_key, explain_error
 from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register_components
 from memmlp.config.schema import Config
 
@@ -103,8 +103,13 @@ class UserConfigs(SearchPathPlugin):
 
 def compose_config(overrides: Sequence[str]) -> DictConfig:
     """Compose and check a single job's config."""
-    (cfg,) = compose_jobs(parse_hydra_arguments(overrides))
-    return cfg
+    return compose_checked(overrides).cfg
+
+
+def compose_checked(overrides: Sequence[str]) -> CheckedConfig:
+    """Compose and check a single job's config, and resolve it."""
+    (job,) = _compose_jobs(parse_hydra_arguments(overrides))
+    return job
 
 
 def compose_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
@@ -150,16 +155,20 @@ def check_overrides(args: argparse.Namespace) -> None:
 
 def compose_jobs(args: argparse.Namespace) -> list[DictConfig]:
     """Compose and check the configs of all jobs, before any job starts."""
+    return [job.cfg for job in _compose_jobs(args)]
+
+
+def _compose_jobs(args: argparse.Namespace) -> list[CheckedConfig]:
     _check_first_key_parts(args)
-    configs = []
+    jobs = []
     with _initialize_hydra(args):
         for overrides in _list_jobs(args):
             with _convert_errors(overrides):
-                configs.append(_compose_job(args, overrides))
-            check(configs[-1])
-            _reject_overrides_without_effect(configs[-1], overrides)
-    _check_texts(configs[0], args.overrides)
-    return configs
+                cfg = _compose_job(args, overrides)
+            jobs.append(check(cfg))
+            _reject_overrides_without_effect(jobs[-1].resolved, overrides)
+    _check_texts(jobs[0].resolved, args.overrides)
+    return jobs
 
 
 def _check_first_key_parts(args: argparse.Namespace) -> None:
@@ -252,31 +261,33 @@ def _make_node(slot: str, name: str) -> DictConfig | None:
     return None
 
 
-def _reject_overrides_without_effect(cfg: DictConfig, overrides: Sequence[str]) -> None:
+def _reject_overrides_without_effect(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
     """Raise InputError for overrides without an effect: a plugin in a config file, and a split fraction if
     each source sets its own."""
-    for name in cfg.plugins:
+    for name in config["plugins"]:
         if name not in plugins.list_active():
             raise InputError(
                 f"plugins=[{name}]: cannot be set in a config file; set it on the command line, in the base "
                 f"of a sweep or search, or with {plugins.VARIABLE}={name}"
             )
-    sources = (cfg.data.get("sources") or {}).values()
+    sources = (config["data"].get("sources") or {}).values()
     for override in parse_overrides(overrides):
-        if override.key == "profile.lr" and cfg.optim.lr != cfg.profile.lr:
-            raise InputError(f"{override}: has no effect: model={cfg.model.name} sets optim.lr; set that")
+        if override.key == "profile.lr" and config["optim"]["lr"] != config["profile"]["lr"]:
+            model = config["model"]["name"]
+            raise InputError(f"{override}: has no effect: model={model} sets optim.lr; set that")
         part = override.key.removeprefix("data.split.")
         own = [one.get(part) for one in sources] if part in ("test", "val") else [None]
         if own and None not in own:
             raise InputError(f"{override}: each source sets its own value; set data.sources.NAME.{part}")
 
 
-def _check_texts(cfg: DictConfig, overrides: Sequence[str]) -> None:
+def _check_texts(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
     """Raise InputError for a text that Hydra would change, because it reads the text as a number or bool. For
     example, a folder 2024_11 would become 202411, and 1e3 would become 1000.0."""
+    values = flatten(config)
     for parsed in OverridesParser.create().parse_overrides(list(overrides)):
-        value, kept = parsed.value(), OmegaConf.select(cfg, parsed.key_or_group)
-        texts = list(kept) if OmegaConf.is_list(kept) else [kept]
+        value, kept = parsed.value(), values.get(parsed.key_or_group)
+        texts = kept if isinstance(kept, list) else [kept]
         if not all(isinstance(text, str) for text in texts):
             continue
         typed = Override.parse(str(parsed.input_line))

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest, find_packaged_folder
 from memmlp.common.overrides import Override
-from memmlp.common.text_formats import escape_interpolations
 from memmlp.config.plugins import activate, find_named_packages
 from memmlp.sweep.definition import Sweep, Variant, parse_key, save_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
@@ -112,15 +111,14 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
 
 def _build_requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[tuple[int, RunRequest]]:
     from memmlp.config.build_request import build_requests
-    from memmlp.config.compose import compose_config
+    from memmlp.config.compose import compose_checked
 
     seeds = sweep.get_seeds(variant)
     try:
-        cfg = compose_config(list(sweep.merge_overrides(variant)))
-        if cfg.force:  # variants may share a run, which would be trained repeatedly
+        checked = compose_checked(list(sweep.merge_overrides(variant)))
+        if checked.resolved["force"]:  # variants may share a run, which would be trained repeatedly
             raise InputError("force=true: expected --again, which trains a sweep's finished runs again")
-        cfg.paths.outputs = escape_interpolations(str(outputs))
-        yield from zip(seeds, build_requests(cfg, seeds), strict=True)
+        yield from zip(seeds, build_requests(checked, outputs, seeds), strict=True)
     except InputError as error:
         raise InputError(f"sweep {sweep.name}, variant '{variant.label}': {error}") from None
 

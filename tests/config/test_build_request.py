@@ -5,14 +5,15 @@ from pathlib import Path
 
 import pytest
 import yaml
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.components import collect_components, find_component
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
-from memmlp.config.build_request import build_motion
+from memmlp.config.build_request import build_request
 from memmlp.config.compose import compose_config
 from memmlp.config.schema import restore_config
+from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.find_clips import NamedFolders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
@@ -35,33 +36,37 @@ def mix(changes: dict | None = None, *words: str):
     return compose_config(["--config-dir", "conf", "data=my_mix", *words])
 
 
+def motion_of(cfg: DictConfig) -> MotionSource:
+    return build_request(cfg).motion
+
+
 def with_source(**keys) -> dict:
     return {"sources": {**MIX["sources"], "cmu": {**MIX["sources"]["cmu"], **keys}}}
 
 
 def test_a_list_of_folders_names_sources_after_them():
-    one, listed = (build_motion(compose_config(["data=mocap", f"data.root={root}"])) for root in ("a", "[a]"))
+    one, listed = (motion_of(compose_config(["data=mocap", f"data.root={root}"])) for root in ("a", "[a]"))
     assert one == listed
     assert isinstance(one.clips.split, SeededSplit)
-    source = build_motion(compose_config(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).clips
+    source = motion_of(compose_config(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).clips
     assert source.root == NamedFolders({"b": Path("b"), "a": Path("a")})
     assert isinstance(source.split, MixedSplit)
     assert {split.test for split in source.split.splits.values()} == {0.2}
     with pytest.raises(InputError, match=r"data\.root"):
-        build_motion(compose_config(["data=mocap", "data.root=[a,x/a]"]))
+        motion_of(compose_config(["data=mocap", "data.root=[a,x/a]"]))
 
 
 def test_named_sources_have_fractions_of_their_own():
-    split = build_motion(mix(with_source(test=0.35), "data.split.val=0.05")).clips.split
+    split = motion_of(mix(with_source(test=0.35), "data.split.val=0.05")).clips.split
     assert isinstance(split, MixedSplit)
     held_out = {name: (own.test, own.val) for name, own in split.splits.items()}
     assert held_out == {"cmu": (0.35, 0.05), "bandai": (0.1, 0.05)}
     with pytest.raises(InputError, match=r"data\.sources\.cmu: .*data\.split\.val"):
-        build_motion(mix(with_source(val=0.95)))
+        motion_of(mix(with_source(val=0.95)))
 
 
 def test_named_sources_have_groups_of_their_own():
-    split = build_motion(mix(None, "data.split.val=0.2")).clips.split
+    split = motion_of(mix(None, "data.split.val=0.2")).clips.split
     assert split.splits["cmu"].groups[0] == "salsa/(?:01|16)$"
     (last,) = set(split.splits["bandai"].groups) - set(split.splits["cmu"].groups)
     kinds = [(d, style, n) for d in (1, 2) for style in ("sad", "old") for n in (1, 2)]
@@ -71,9 +76,9 @@ def test_named_sources_have_groups_of_their_own():
         name: f"dataset-1_walk-left_{name.split('_')[2]}_001" for name in names
     }
     Path("groups.csv").write_text("clip,group\nsalsa/01,ann\n")
-    own = build_motion(mix(with_source(groups_file="groups.csv")))
+    own = motion_of(mix(with_source(groups_file="groups.csv")))
     assert own.clips.split.splits["cmu"].grouping.rows == {"salsa/01": "ann"}
-    assert own.groups_digest != build_motion(mix()).groups_digest
+    assert own.groups_digest != motion_of(mix()).groups_digest
 
 
 @pytest.mark.parametrize(("changes", "words", "said"), [
@@ -119,11 +124,11 @@ def test_own_groups_and_column_files_enter_the_evaluation_alone():
 def test_a_run_on_a_mix_is_restored():
     cfg = mix()
     record = OmegaConf.to_container(cfg, resolve=True)
-    assert build_motion(restore_config(record)) == build_motion(cfg)
+    assert motion_of(restore_config(record)) == motion_of(cfg)
 
 
 def test_another_version_of_a_generator_makes_other_motion(monkeypatch: pytest.MonkeyPatch):
-    before = build_motion(compose_config(["profile=tiny"])).clips.root
+    before = motion_of(compose_config(["profile=tiny"])).clips.root
     newer = replace(find_component("generator", "puppet"), version=7)
     monkeypatch.setitem(collect_components(), ("generator", "puppet"), newer)
-    assert build_motion(compose_config(["profile=tiny"])).clips.root == before.with_name(f"{before.name}-v7")
+    assert motion_of(compose_config(["profile=tiny"])).clips.root == before.with_name(f"{before.name}-v7")

@@ -7,7 +7,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.config.build_request import build_request, build_requests
-from memmlp.config.compose import compose_config
+from memmlp.config.compose import compose_checked, compose_config
 from memmlp.config.compose_plan import find_sweep, get_sweep_folder
 
 NO_MEMORY = "variants: {a: [], b: [experiment=no_memory]}"
@@ -49,16 +49,16 @@ def test_a_sweep_has_one_folder_in_whatever_order_it_is_asked_for(tmp_path: Path
     assert get_sweep_folder(sweep, tmp_path) == tmp_path / "sweeps" / sweep.name
 
 
-def test_requests_of_several_seeds_are_those_of_each_seed():
-    cfg = compose_config(["vqvae.seed=${seed}", "memory=vq", "data.synth.minutes=0.5"])
-    requests = list(build_requests(cfg, [4, 0, 7]))
-    assert [request.config["vqvae"]["seed"] for request in requests] == [4, 0, 7]
-    for seed, request in zip([4, 0, 7], requests, strict=True):
-        cfg.seed = seed
-        assert (request.config, request.motion.clips) == (
-            build_request(cfg).config,
-            build_request(cfg).motion.clips,
-        )
-    cfg.data.synth.seed = "${seed}"
-    assert [one.config["data"]["synth"]["seed"] for one in build_requests(cfg, [1, 2])] == [1, 2]
-    assert len({str(one.motion.clips.root) for one in build_requests(cfg, [1, 2])}) == 2
+def test_requests_of_several_seeds_are_those_of_each_seed(tmp_path: Path):
+    words = ["memory=vq", "data.synth.minutes=0.5", "vqvae.batch=${vqvae.codes}", "vqvae.codes=${vqvae.seed}"]
+    checked = compose_checked(["vqvae.seed=${seed}", "seed=4", *words])
+    requests = list(build_requests(checked, tmp_path, [4, 9, 7]))
+    assert [request.config["vqvae"]["batch"] for request in requests] == [4, 9, 7]
+    for seed, request in zip([4, 9, 7], requests, strict=True):
+        alone = [f"vqvae.seed={seed}", f"seed={seed}", *words, f"paths.outputs={tmp_path}"]
+        expected = build_request(compose_config(alone))
+        assert (request.config, request.motion.clips) == (expected.config, expected.motion.clips)
+    checked.cfg.data.synth.seed = "${seed}"
+    requests = list(build_requests(checked, tmp_path, [1, 2]))
+    assert [one.config["data"]["synth"]["seed"] for one in requests] == [1, 2]
+    assert len({str(one.motion.clips.root) for one in requests}) == 2

@@ -17,7 +17,7 @@ from memmlp.common import components
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
 from memmlp.config.build import build_experiment, load_config
-from memmlp.config.build_request import build_motion
+from memmlp.config.build_request import build_request
 from memmlp.config.compose import compose_config
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restore_config
@@ -198,7 +198,7 @@ def test_a_custom_data_source_and_custom_coordinates(folder: Path):
     write(folder, {**files, "mine/conf/data/walks.yaml": yaml})
     words = ["data=walks", "data.synth.minutes=2", "data.synth.seed=3", "normalizer.coordinates=floor"]
     cfg = compose_config(["plugins=[mine]", *words])
-    source, experiment = build_motion(cfg), build_experiment(cfg)
+    source, experiment = build_request(cfg).motion, build_experiment(cfg)
     assert source.clips.root == Path("made/walks-minutes2.0-seed3")
     source.generate(folder)
     assert (folder / "2.0 3").exists()

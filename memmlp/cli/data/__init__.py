@@ -8,7 +8,6 @@ from memmlp.cli.data.importing import import_, skeleton, verify
 from memmlp.cli.data.printing import show_exported, show_manifest, show_pairs, show_rates, show_skipped
 from memmlp.cli.options import PATH, FiniteFloat, body_option, format_option, strict_option
 from memmlp.common.errors import InputError
-from memmlp.common.text_formats import escape_interpolations
 
 
 @click.group("data")
@@ -72,16 +71,14 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
     The cache's manifest has the outcome for each file. `memmlp train` does not need this command, because it
     makes its own cache of data.root. The overrides are those of `memmlp train`; the default is data=mocap.
     """
-    from omegaconf import OmegaConf
-
     from memmlp.config.build_request import build_motion
-    from memmlp.config.compose import compose_config
+    from memmlp.config.compose import compose_checked
     from memmlp.motion.preparing.cache import prepare_cache
 
     has_protocol = any(override.startswith("data=") for override in overrides)
-    cfg = compose_config([*([] if has_protocol else ["data=mocap"]), *overrides, "data.root=."])
-    OmegaConf.update(cfg, "data.root", escape_interpolations(str(root)))
-    show_manifest(prepare_cache(build_motion(cfg).clips, out))
+    config = compose_checked([*([] if has_protocol else ["data=mocap"]), *overrides, "data.root=."]).resolved
+    config["data"]["root"] = str(root)
+    show_manifest(prepare_cache(build_motion(config).clips, out))
 
 
 @data.command("inspect")

@@ -12,7 +12,7 @@ from conftest import one_line
 
 import memmlp.cli.data as commands
 from memmlp.common.errors import InputError
-from memmlp.config.build_request import build_motion
+from memmlp.config.build_request import build_request
 from memmlp.config.compose import compose_config
 from memmlp.motion import synthetic
 from memmlp.motion.formats.npz import write_clip
@@ -59,7 +59,7 @@ def test_a_cache_has_the_clips_of_training(memmlp, tmp_path: Path, monkeypatch: 
     ):
         ran = memmlp("data", "prepare", "clips", "--out", "cache", *words)
         assert ran.code == 0, ran.err
-        assert found[-1] == build_motion(compose_config([*train, "data.root=clips"])).clips
+        assert found[-1] == build_request(compose_config([*train, "data.root=clips"])).motion.clips
     bad = memmlp("data", "prepare", "clips", "--out", "cache", "data.split.val=2")
     assert one_line(bad, "data.split.val=2")
 

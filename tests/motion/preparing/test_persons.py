@@ -11,7 +11,7 @@ import pytest
 from conftest import Memmlp
 
 from memmlp.common.errors import InputError
-from memmlp.config.build_request import build_motion
+from memmlp.config.build_request import build_request
 from memmlp.config.compose import compose_config
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
@@ -34,11 +34,11 @@ def split(**changes: Any) -> PersonSplit:
 def shipped(tmp_path: Path) -> MotionSource:
     (tmp_path / "clips").mkdir()
     outputs = f"paths.outputs={tmp_path / 'outputs'}"
-    return build_motion(compose_config(["data=persons", f"data.root={tmp_path / 'clips'}", outputs]))
+    return build_request(compose_config(["data=persons", f"data.root={tmp_path / 'clips'}", outputs])).motion
 
 
 def compose_split(data: str, root: Path) -> Split:
-    return build_motion(compose_config([f"data={data}", f"data.root={root}"])).clips.split
+    return build_request(compose_config([f"data={data}", f"data.root={root}"])).motion.clips.split
 
 
 def members(persons: Iterable[str]) -> list[str]:
