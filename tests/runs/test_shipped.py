@@ -1,5 +1,6 @@
 """The shipped networks: found by name, and as their cards say."""
 
+import itertools
 import json
 import re
 import subprocess
@@ -80,20 +81,20 @@ def test_errors_on_a_test_persons_take_are_those_of_the_evaluation(tmp_path: Pat
     if not ARCHIVE.exists():
         pytest.skip(f"needs {ARCHIVE.name}, which is not part of the project")
     with tarfile.open(ARCHIVE, "r|xz") as archive:
-        for entry in archive:
-            if entry.name.endswith(("/86.asf", "/86_09.amc")):
-                archive.extract(entry, tmp_path / "sets", filter="data")
+        wanted = (entry for entry in archive if entry.name.endswith(("/39.asf", "/39_08.amc")))
+        for entry in itertools.islice(wanted, 2):
+            archive.extract(entry, tmp_path / "sets", filter="data")
     import_folder(tmp_path / "sets", tmp_path / "clips")
     (path,) = (tmp_path / "clips").rglob("*.npz")
     clip = ShippedMotion(path, load_rest_joints("builtin")).open("test").read_clip(0)
     for name in NAMES:
         opened = open_existing_run(find_run(tmp_path, name))
         (report,) = (json.loads(path.read_text()) for path in opened.run.evaluations.glob("stream-*.json"))
-        (row,) = (row for row in report["clips"] if row["name"].endswith("/86_09"))
+        (row,) = (row for row in report["clips"] if row["name"].endswith("/39_08"))
         predicted = stream_onnx(OnnxStream(opened.run.preferred_onnx), clip)
         found = measure_clip(opened.network().normalizer, predicted, clip)["rotation"]
         for metric, value in row["rotation"].items():
-            assert float(found[metric]) == pytest.approx(float(value), rel=0.01), (name, metric)
+            assert float(found[metric]) == pytest.approx(float(value), rel=0.01, abs=1e-4), (name, metric)
 
 
 @pytest.mark.slow
