@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
@@ -23,14 +22,12 @@ from memmlp.common.components import (
     find_component,
 )
 from memmlp.common.errors import InputError, is_interruption
-from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import flatten, format_value
 from memmlp.common.text_formats import escape_interpolations, make_override
 from memmlp.config import plugins
 from memmlp.config.build_request import build_request, read_source_weights
 from memmlp.config.check import check
-from memmlp.config.component_source import register_components
-from memmlp.config.compose import VERSION_BASE, compose_config
+from memmlp.config.compose import compose_config, compose_unchecked
 from memmlp.config.schema import restore_config
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
@@ -314,7 +311,7 @@ def make_readable_name(kind: str, config: Mapping[str, Any]) -> str:
     words += ["published weights"] if config.get("imported_weights") else []
     try:
         words += _list_differences(config)
-    except (HydraException, OmegaConfBaseException) as error:  # the run must not fail because of its name
+    except (InputError, HydraException, OmegaConfBaseException) as error:  # a run must not fail by its name
         if is_interruption(error):
             raise
         words.append("own config")
@@ -405,13 +402,10 @@ def _is_shipped(slot: str, option: str) -> bool:
 def _compose_default(overrides: tuple[str, ...]) -> dict[str, Any]:
     """Return the config of `memmlp train` with these overrides, without groups that names omit. Hydra's
     global state is restored afterwards."""
-    register_components()
     hydra = GlobalHydra.instance()
     before, hydra.hydra = hydra.hydra, None
     try:
-        folder = str(find_packaged_folder("conf"))
-        with initialize_config_dir(folder, version_base=VERSION_BASE, job_name="name"):
-            cfg = compose("train", list(overrides))
+        cfg = compose_unchecked(overrides)
     finally:
         GlobalHydra.instance().hydra = before
     groups = {str(key): cfg[key] for key in cfg if key not in ("data", "paths", "loggers")}

@@ -112,6 +112,13 @@ def compose_checked(overrides: Sequence[str]) -> CheckedConfig:
     return job
 
 
+def compose_unchecked(overrides: Sequence[str]) -> DictConfig:
+    """Compose a single job's config without checks."""
+    args = parse_hydra_arguments(overrides)
+    with _initialize_hydra(args):
+        return _compose_job(args, list(overrides))
+
+
 def compose_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
     """Compose another config than `train`, also from a `folder` of custom configs, which is searched first,
     and return it as plain dictionaries. It is not checked."""
