@@ -17,3 +17,4 @@ def test_a_network_that_hardly_saw_motion_says_so(tmp_path: Path, capsys, steps:
     said = capsys.readouterr().out
     assert ("hardly trained" in said) == told
     assert f"run      {run.folder}\n" in said
+    assert "picture" not in said  # which the run has not

@@ -33,7 +33,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tune")
     words = ["tune", *TINY, *TRIALS, "--workers", "1"]
     with forked(in_folder, folder, *words) as process:
-        until(lambda: count_trials(folder) == 2, "the second trial", process)
+        until(lambda: (study := view(folder)) and len(study.trials) == 2, "the second trial", process)
         process.kill()
         assert process.wait() == -signal.SIGKILL
     (folder / "said.txt").write_text(run_apart(folder, *words))
@@ -44,10 +44,6 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def view(home: Path) -> Study | None:
     setup = prepare_search([*TINY, *TRIALS], None, home / "outputs")
     return Study.view(setup.search, setup.folder.name, setup.folder)
-
-
-def count_trials(home: Path) -> int:
-    return len(study.trials) if (study := view(home)) else 0
 
 
 def read_trials(folder: Path) -> list[dict[str, str]]:
@@ -78,7 +74,6 @@ def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
 
 def test_a_killed_search_has_the_trials_of_an_undisturbed_one(home: Path, tmp_path: Path):
     study = view(home)
-    assert study is not None
     undisturbed = Study.open(study.search, "undisturbed", tmp_path)
     assert [trial.params for trial in study.trials] == [undisturbed.ask().params for _ in range(2)]
 

@@ -13,7 +13,6 @@ from memmlp.config.build import build_experiment
 from memmlp.config.build_request import build_request
 from memmlp.config.compose import compose_config
 from memmlp.config.schema import restore_config
-from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.find_clips import NamedFolders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
@@ -36,7 +35,7 @@ def mix(changes: dict | None = None, *words: str):
     return compose_config(["--config-dir", "conf", "data=my_mix", *words])
 
 
-def motion_of(cfg: DictConfig) -> MotionSource:
+def motion_of(cfg: DictConfig):
     return build_request(cfg).motion
 
 

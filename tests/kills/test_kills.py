@@ -1,7 +1,4 @@
-"""Processes killed at arbitrary moments: a training, a sweep and a search end as undisturbed ones do.
-
-A search killed once: tests/cli/test_tune.py.
-"""
+"""Processes killed at arbitrary moments: a training, a sweep and a search end as undisturbed ones do."""
 
 import json
 import random
@@ -27,6 +24,7 @@ def last_step(outputs: Path) -> int:
     return max((int(checkpoint.read(file)[1]["step"]) for file in files), default=0)
 
 
+FREQUENT = ["evaluation.modes=[stream]", "optim.checkpoint_every=5"]
 MOMENTS = {
     "the VQ-VAE is there, and no checkpoint": lambda outputs: list(outputs.glob("runs/*/DONE")),
     "the network is trained further": lambda outputs: last_step(outputs) >= 20,
@@ -35,8 +33,7 @@ MOMENTS = {
 
 @pytest.mark.slow
 def test_a_killed_training_resumes_to_the_same_model(tmp_path: Path):
-    words = ["train", *BRIEF, "optim.steps=40", "optim.checkpoint_every=5", "export.graph=off"]
-    words += ["evaluation.modes=[stream]"]
+    words = ["train", *BRIEF, "optim.steps=40", *FREQUENT, "export.graph=off"]
     disturbed, whole = tmp_path / "disturbed", tmp_path / "whole"
     for folder in (disturbed, whole):
         folder.mkdir()
@@ -68,7 +65,7 @@ def fork_controllers(folder: Path, monkeypatch: pytest.MonkeyPatch, *workers: st
 @pytest.mark.parametrize("during", ["anything", "checkpoints", "evaluation", "export"])
 def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch, during: str):
     fork_controllers(tmp_path, monkeypatch, "executor=debug")
-    words, controllers = [*SMALL, "evaluation.modes=[stream]", "optim.checkpoint_every=5"], 1
+    words, controllers = [*SMALL, *FREQUENT], 1
     if during == "anything":
         words, controllers = [*words, "export.graph=off"], 2
     else:
