@@ -161,7 +161,7 @@ def _describe_table(source: KeptTable) -> Iterator[str]:
         return
     yield f"Mode: {table.modes[0]}; {escape_markdown(describe_branches(table))}."
     if any(table.list_effects(table.modes[0])):
-        verdict = "its [verdict](README.md#verdicts)"
+        verdict = "its [verdict](pages.md#verdicts)"
         yield f"In parentheses: the difference from {_name_control(table)} and {verdict}."
         if table.comparisons:
             yield f"Verdicts are corrected for this page's {table.comparisons} comparisons."
