@@ -5,7 +5,6 @@ from xml.etree import ElementTree
 
 import pytest
 
-from memmlp.cli.demo import describe_next_steps
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.runs.lookup import DEFAULT, read_card
 
@@ -21,11 +20,8 @@ def test_the_demo_ends_with_a_table_and_a_file(memmlp, tmp_path: Path):
     assert ran.code == 0, ran.err
     assert [line[:3] for line in ran.out.splitlines() if line[1:3] == ". "] == ["1. ", "2. ", "3. "]
     assert "Without memory" in ran.out
+    assert f"sweep demo {TINY[0]}" in " ".join(ran.out.split())
     assert f"{read_card(DEFAULT)['clip']['errors']['rotation']['MPJPE']:.1f} cm" in ran.out
     picture = ElementTree.parse(tmp_path / "demo" / "clip.svg")
     assert picture.getroot().tag.endswith("svg")
     assert OnnxStream(tmp_path / "demo" / "mem_mlp.onnx").inputs["sparse"].shape == (1, 54)
-
-
-def test_next_steps_repeat_the_overrides():
-    assert "memmlp sweep demo optim.steps=7 seed=0,1,2,3,4" in describe_next_steps(["optim.steps=7"])

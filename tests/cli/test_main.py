@@ -135,13 +135,10 @@ def test_exit_codes(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, error: Base
     assert ran.out == ""
 
 
-def test_a_bug_shows_where_it_is(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
+def test_bugs_and_on_request_errors_have_tracebacks(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("memmlp.cli.train.run_training", Mock(side_effect=ZeroDivisionError("a bug")))
     with pytest.raises(ZeroDivisionError, match="a bug"):
         memmlp("train")
-
-
-def test_tracebacks_on_request(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MEMMLP_TRACEBACK", "1")
     with pytest.raises(InputError, match="unknown command"):
         main(["trian"])

@@ -19,6 +19,12 @@ def test_agrol_windows_see_nothing_of_other_windows():
     assert not torch.allclose(before[6], after[6])
 
 
+def test_a_time_has_a_sine_and_a_cosine_of_each_rate():
+    found = tiny.baseline("agrol_diffusion").embed_time(torch.tensor([3]))[0]
+    angles = 3 / 10_000 ** (torch.arange(0, len(found), 2) / len(found))
+    torch.testing.assert_close(found, torch.stack([angles.sin(), angles.cos()], 1).flatten())
+
+
 def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
     """The training call gives the denoiser noised true rotations, drawn times and the window's inputs."""
     model, seen = tiny.baseline("agrol_diffusion"), []
