@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import csv
 import itertools
 import json
 import sys
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from io import BytesIO
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
 import jinja2
@@ -52,6 +54,10 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 MARK = "<!-- made by: docs/results/make_pages.py -->"
+TRIALS = "budget_trials.csv"
+SEARCHED = (
+    "optim", "optim.lr", "optim.weight_decay", "optim.batch", "profile.scale", "data.mirror", "loss",
+)  # fmt: skip
 FILES = "tables"  # folder of the CSV files and the remarks, below the folder of the pages
 MAX_REMARK = 160  # maximum length of a remark with a list of variants on a page, characters
 ORIGIN = {
@@ -66,6 +72,9 @@ TIME_COLUMNS = {
     "pose ms": "*pose ms*: from the trackers to the avatar's joints.",
     RATIO: "The yardstick is a fixed chain of matrix products, timed in turn with the step.",
 }  # explanations of columns
+
+
+Trial = Mapping[str, str]  # a line of TRIALS
 
 
 class KeptTable(NamedTuple):
@@ -90,12 +99,15 @@ class KeptTable(NamedTuple):
         return {"all": self.table, **dict(zip(names, self.by_source, strict=True))}
 
 
-def make_pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
+def make_pages(
+    sources: Mapping[str, KeptTable], templates: Mapping[str, str], trials: Sequence[Trial] = ()
+) -> dict[str, str]:
     """Return the texts of all pages and of the files beside them, by path below the folder of the pages.
 
     Args:
         sources: the tables by page name, without the suffix.
         templates: the templates' texts by file name.
+        trials: the trials of a search at equal compute.
 
     Raises:
         InputError: if a template and a table have the same page name, or a placeholder has an unknown name.
@@ -109,7 +121,7 @@ def make_pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -
     if sources:
         remarks = {name: _list_all_remarks(source) for name, source in sorted(sources.items())}
         made[f"{FILES}/remarks.json"] = json.dumps(remarks, indent=1, ensure_ascii=False) + "\n"
-    placeholders = Placeholders(sources).collect_functions()
+    placeholders = Placeholders(sources, trials).collect_functions()
     return made | {name: _fill_template(name, text, placeholders) for name, text in sorted(templates.items())}
 
 
@@ -357,8 +369,8 @@ def _fill_template(name: str, text: str, placeholders: Mapping[str, object]) -> 
 class Placeholders:
     """The functions that templates can call. An unknown name raises InputError with the valid names."""
 
-    def __init__(self, sources: Mapping[str, KeptTable]):
-        self.sources = sources
+    def __init__(self, sources: Mapping[str, KeptTable], trials: Sequence[Trial]):
+        self.sources, self._trials = sources, trials
         self._regrouped: dict[tuple[str, tuple[str, ...]], Table] = {}
 
     def collect_functions(self) -> dict[str, object]:
@@ -454,6 +466,30 @@ class Placeholders:
                 number = f"{format_mean(cell, metric)} {find_unit(metric)}"
                 texts.append(f"'{row.label}' {number} ({price:.2g})")
         return escape_markdown(join_first(texts))
+
+    def searches(self, trials: int, tflop: float) -> str:
+        """Return a table of a search at equal compute, with the best of the first trials of each network.
+        Raises InputError if a trial is missing, or its compute differs from `tflop` by more than 5 %."""
+        by_network: dict[str, list[Trial]] = {}
+        for trial in sorted(self._trials, key=lambda one: int(one["trial"])):
+            by_network.setdefault(trial["network"], []).append(trial)
+        lines = []
+        for network, found in by_network.items():
+            if [int(one["trial"]) for one in found[:trials]] != list(range(trials)):
+                raise InputError(f"{TRIALS}: {network} must have trials 0 to {trials - 1}")
+            if bad := [one for one in found if not 0.95 <= float(one["tflop"]) / tflop <= 1.05]:
+                raise InputError(f"{TRIALS}: {network} {bad[0]['trial']}: must have {tflop} TFLOP")
+            errors = sorted(float(one["MPJPE"]) for one in found[:trials])
+            best = min(found[:trials], key=lambda one: float(one["MPJPE"]))
+            values = [best[column] for column in SEARCHED]
+            lines.append((errors[0], [network, f"{errors[0]:.2f}", f"{median(errors):.2f}", *values]))
+        heads = ["network", "best", "median", *(head.rpartition(".")[2] for head in SEARCHED)]
+        return _make_markdown_table(heads, [line for _, line in sorted(lines)])
+
+    def counted_compute(self) -> str:
+        """Return the range of the trials' training compute."""
+        counted = [float(trial["tflop"]) for trial in self._trials]
+        return f"{min(counted):.3g} to {max(counted):.3g} TFLOP"
 
     def _count_claims(self, tables: Iterable[Table], mode: str, branch: str) -> str:
         counts: dict[str, Counter[Verdict]] = {"": Counter(), f"{CONFOUNDED} ": Counter()}
@@ -656,8 +692,10 @@ def make_tables(folder: Path) -> dict[str, KeptTable]:
 def update(folder: Path, check: bool) -> int:
     """Write the pages that differ, and remove old ones; with `check` only list them. Return the exit code."""
     templates = {path.name: path.read_text(encoding="utf-8") for path in (folder / "templates").glob("*.md")}
-    tables = make_tables(folder)
-    made = make_pages(tables, templates)
+    tables, trials = make_tables(folder), folder / TRIALS
+    made = make_pages(
+        tables, templates, list(csv.DictReader(trials.open(newline=""))) if trials.exists() else ()
+    )
     paths = [*folder.glob("*.md"), *(folder / FILES).glob("*")]
     present = {str(path.relative_to(folder)): path.read_bytes().decode("utf-8", "replace") for path in paths}
     differing = [name for name, text in made.items() if present.get(name) != text]
