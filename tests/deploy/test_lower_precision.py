@@ -50,7 +50,7 @@ def _is_of(constant: np.ndarray, weights: Iterable[np.ndarray]) -> bool:
     return any(np.array_equal(constant, one) or np.array_equal(constant, one.T) for one in weights)
 
 
-@pytest.mark.parametrize("network", ["mem_mlp", "refined"])
+@pytest.mark.parametrize("network", ["mem_mlp", pytest.param("refined", marks=pytest.mark.long)])
 def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, network: str):
     source, path = step_files(network), tmp_path / "half.onnx"
     stream = make_streaming_graph(exported.NETWORKS[network]())
