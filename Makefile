@@ -19,9 +19,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/memmlp demo
 
-# One process more than cores, since some tests wait for other processes. They share compiled code.
+# A process for each core; one more costs as much in imports as it gains. They share compiled code.
 CORES := $(BIN)/python -c 'from memmlp.common.processes import count_usable_cores; print(count_usable_cores())'
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $$(($$($(CORES)) + 1))
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $$($(CORES))
 
 test: $(STAMP)
 	$(PYTEST)
