@@ -9,14 +9,9 @@ from pathlib import Path
 import pytest
 from fake_runs import fake_run, table_of
 
-from docs.results.make_pages import (
-    KeptTable,
-    draw_frontiers,
-    draw_pictures,
-    has_frontier,
-    list_points,
-    make_pages,
-)
+from docs.results.frontiers import draw_frontiers, has_frontier, list_points
+from docs.results.make_pages import draw_pictures, make_pages
+from docs.results.table_page import KeptTable
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
 from memmlp.report.tables.table import Table

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from docs.results.make_pages import KeptTable, make_pages, shorten_remark
+from docs.results.make_pages import make_pages
+from docs.results.table_page import KeptTable, shorten_remark
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults

@@ -1,0 +1,101 @@
+"""Frontiers: error against training compute and latency."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from io import BytesIO
+from typing import TYPE_CHECKING, NamedTuple
+
+from memmlp.report.tables.table import Table
+from memmlp.report.tables.table_text import (
+    add_unit,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COMPUTE, LATENCY = "tflop", "ms"
+MIN_RATIO = 1.1  # minimum ratio between two budgets of a frontier
+
+
+class Point(NamedTuple):
+    """A variant's place on a frontier.
+
+    Attributes:
+        series: the network, whose variants with other budgets are on the same curve.
+        label: the variant's label.
+        cost: training compute in TFLOP, or latency in ms.
+        mean, low, high: the error with its 95 % interval over seeds and clip groups; without an interval, all
+            are the mean.
+    """
+
+    series: str
+    label: str
+    cost: float
+    mean: float
+    low: float
+    high: float
+
+
+def has_frontier(table: Table) -> bool:
+    """Return whether at least three variants have a known training compute, and it differs."""
+    known = [row.costs[COMPUTE] for row in table.rows if COMPUTE in row.costs]
+    return bool(table.measured_metrics) and len(known) > 2 and max(known) > MIN_RATIO * min(known)
+
+
+def choose_metric(table: Table) -> str:
+    """Return MPJPE if the table has it, otherwise its first error metric."""
+    return "MPJPE" if "MPJPE" in table.measured_metrics else table.measured_metrics[0]
+
+
+def list_points(table: Table, cost: str) -> Iterator[Point]:
+    """Yield the places of the table's variants with a known cost, in its first mode, by series and cost."""
+    mode, metric = table.modes[0], choose_metric(table)
+    for row in sorted(table.rows, key=lambda row: (row.series, row.costs.get(cost, 0.0))):
+        cell = row.cells[mode][metric]
+        if cost in row.costs and cell.mean is not None:
+            low, high = (cell.mean if one is None else one for one in (cell.low, cell.high))
+            yield Point(row.series, row.label, row.costs[cost], cell.mean, low, high)
+
+
+SHIFT = 1.015  # ratio of neighbouring networks' places, so that intervals at one budget do not overlap
+LABELS = {COMPUTE: "training compute [TFLOP]", LATENCY: "live latency of a step [ms]"}
+
+
+def draw_frontiers(table: Table) -> bytes:
+    """Return a picture (SVG) of error against training compute and against latency, side by side."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
+
+    points = {cost: list(list_points(table, cost)) for cost in LABELS}
+    names = sorted({point.series for found in points.values() for point in found})
+    with rc_context({"svg.hashsalt": table.name, "font.size": 9}):
+        figure = Figure(figsize=(9, 3.6), layout="constrained")
+        first = None
+        for number, (cost, found) in enumerate(points.items(), 1):
+            first = axes = figure.add_subplot(1, 2, number, sharey=first)
+            _draw_curves(axes, found, names, SHIFT if cost == COMPUTE else 1.0)
+            axes.set_xscale("log", subs=[])
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.set(xlabel=LABELS[cost], ylabel=add_unit(choose_metric(table)))
+            axes.grid(alpha=0.25)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+        picture = BytesIO()
+        figure.savefig(picture, format="svg", metadata={"Date": None})
+    return picture.getvalue()
+
+
+def _draw_curves(axes: Axes, points: Sequence[Point], names: Sequence[str], ratio: float) -> None:
+    """Draw a curve for each network; `ratio` is the distance between neighbouring networks at one cost."""
+    for name, group in itertools.groupby(points, key=lambda point: point.series):
+        own = list(group)
+        sides = [[one.mean - one.low for one in own], [one.high - one.mean for one in own]]
+        colour, shift = f"C{names.index(name) % 10}", ratio ** (names.index(name) - len(names) / 2)
+        axes.errorbar(
+            [shift * one.cost for one in own], [one.mean for one in own], sides, label=name, color=colour,
+            marker="o", markersize=4, capsize=2, linewidth=1.4,
+        )  # fmt: skip

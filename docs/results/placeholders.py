@@ -1,0 +1,185 @@
+"""The functions that templates of pages can call."""
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from statistics import median
+
+from docs.results.table_page import BRANCHES, KeptTable, make_markdown_table
+from memmlp.common.errors import InputError
+from memmlp.common.text_formats import escape_markdown
+from memmlp.report.tables.flags import join_first
+from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.table import Table
+from memmlp.report.tables.table_text import (
+    CONFOUNDED,
+    MISSING,
+    find_unit,
+    format_counts,
+    format_mean,
+    make_caption,
+)
+
+TRIALS = "budget_trials.csv"
+SEARCHED = (
+    "optim", "optim.lr", "optim.weight_decay", "optim.batch", "profile.scale", "data.mirror", "loss",
+)  # fmt: skip
+Trial = Mapping[str, str]  # a line of TRIALS
+UNDECIDED = (Verdict.INCONCLUSIVE, Verdict.EQUIVALENT)
+
+
+class Placeholders:
+    """The functions that templates can call. An unknown name raises InputError with the valid names."""
+
+    def __init__(self, sources: Mapping[str, KeptTable], trials: Sequence[Trial]):
+        self.sources, self._trials = sources, trials
+        self._regrouped: dict[tuple[str, tuple[str, ...]], Table] = {}
+
+    def collect_functions(self) -> dict[str, object]:
+        """Return the functions by name, and the list `names` of all results."""
+        methods = {name: getattr(self, name) for name in dir(self) if not name.startswith("_")}
+        return {**methods, "names": sorted(self.sources)}
+
+    def claims(self, names: Sequence[str], joined: str = "", mode: str = "stream") -> str:
+        """Return a table with the verdicts on the paper's effects: a line for each table, a column a branch.
+
+        Only effects with a sign in the paper count. Confounded rows count apart, after their mark.
+
+        Args:
+            names: the names of the tables' results.
+            joined: a regular expression; clips with equal matches are one group in an additional last line.
+            mode: the mode of evaluation.
+        """
+        lines = []
+        for name in names:
+            table = self._find_table(name)
+            cells = [self._count_claims([table], mode, branch) for branch in BRANCHES]
+            lines.append([f"[{escape_markdown(make_caption(table))}]({name}.md)", *cells])
+        heads = ["table", *BRANCHES.values()]
+        for label, pattern in {"all": "", "all, contents joined": joined}.items():
+            if pattern or label == "all":
+                tables = [self._find_table(name, pattern) for name in names]
+                lines.append([label, *(self._count_claims(tables, mode, branch) for branch in BRANCHES)])
+        return make_markdown_table(heads, lines)
+
+    def decisions(
+        self,
+        names: Sequence[str],
+        verdict: str,
+        mode: str = "stream",
+        confounded: bool = False,
+        joined: str = "",
+        above_margin: bool = False,
+    ) -> str:
+        """Return the effects with a verdict such as `holds`, in the branch that the paper prints.
+
+        Args:
+            names: the names of the tables' results.
+            verdict: the verdict.
+            mode: the mode of evaluation.
+            confounded: whether to list only confounded rows, instead of all other rows.
+            joined: a regular expression; clips with equal matches are one group.
+            above_margin: whether the paper's own effect must exceed the smallest effect of interest.
+        """
+        found: dict[str, list[str]] = {}
+        for name in names:
+            table = self._find_table(name, joined)
+            for row, metric, cell, effect in table.list_effects(mode):
+                small = abs(cell.paper_effect or 0) <= above_margin * table.smallest.get(metric, 0)
+                if effect.verdict == verdict and not small and bool(row.confounded) == confounded:
+                    found.setdefault(f"Table {table.number} '{row.label}'", []).append(metric)
+        return escape_markdown("; ".join(f"{row}: {', '.join(metrics)}" for row, metrics in found.items()))
+
+    def overview(self, *patterns: str) -> str:
+        """Return a table of all pages: runs, seeds, and significant differences in the first mode.
+
+        Args:
+            patterns: regular expressions; with equal matches of a pattern, clips become one group in the
+                last column.
+        """
+        lines, captions = [], [make_caption(one.table) for one in self.sources.values()]
+        for name, source in sorted(self.sources.items()):
+            if not source.table.measured_metrics:
+                continue
+            caption = make_caption(source.table)
+            seeds = sorted({len(row.found) for row in source.table.rows if row.found})
+            coarse = MISSING
+            with contextlib.suppress(InputError):  # no clips to merge
+                coarse = self._count_significant(self._regroup(name, patterns)) if source.regroup else MISSING
+            caption = f"{caption} ({name})" if captions.count(caption) > 1 else caption
+            link = f"[{escape_markdown(caption)}]({name}.md)"
+            numbers = [str(source.kept.run_count), " to ".join(map(str, sorted({*seeds[:1], *seeds[-1:]})))]
+            lines.append([link, *numbers, self._count_significant(source.table), coarse])
+        heads = ["page", "runs", "seeds", "significant differences", "the same with contents joined"]
+        return make_markdown_table(heads, lines)
+
+    def leaders(self, names: Sequence[str], metric: str, cost: str, mode: str = "stream") -> str:
+        """Return the variants of some tables that no other one beats in both a metric and a cost."""
+        known = []
+        for row in (row for name in names for row in self._find_table(name).rows):
+            cells = row.cells[mode]
+            price = cells[cost].mean if cost in cells else row.costs.get(cost)
+            if price is not None and (mean := cells[metric].mean) is not None:
+                known.append((price, mean, row))
+        best, texts = float("inf"), []
+        for price, mean, row in sorted(known, key=lambda one: one[:2]):
+            if mean < best:
+                best, cell = mean, row.cells[mode][metric]
+                number = f"{format_mean(cell, metric)} {find_unit(metric)}"
+                texts.append(f"'{row.label}' {number} ({price:.2g})")
+        return escape_markdown(join_first(texts))
+
+    def searches(self, trials: int, tflop: float) -> str:
+        """Return a table of a search at equal compute, with the best of the first trials of each network.
+        Raises InputError if a trial is missing, or its compute differs from `tflop` by more than 5 %."""
+        by_network: dict[str, list[Trial]] = {}
+        for trial in sorted(self._trials, key=lambda one: int(one["trial"])):
+            by_network.setdefault(trial["network"], []).append(trial)
+        lines = []
+        for network, found in by_network.items():
+            if [int(one["trial"]) for one in found[:trials]] != list(range(trials)):
+                raise InputError(f"{TRIALS}: {network} must have trials 0 to {trials - 1}")
+            if bad := [one for one in found if not 0.95 <= float(one["tflop"]) / tflop <= 1.05]:
+                raise InputError(f"{TRIALS}: {network} {bad[0]['trial']}: must have {tflop} TFLOP")
+            errors = sorted(float(one["MPJPE"]) for one in found[:trials])
+            best = min(found[:trials], key=lambda one: float(one["MPJPE"]))
+            values = [best[column] for column in SEARCHED]
+            lines.append((errors[0], [network, f"{errors[0]:.2f}", f"{median(errors):.2f}", *values]))
+        heads = ["network", "best", "median", *(head.rpartition(".")[2] for head in SEARCHED)]
+        return make_markdown_table(heads, [line for _, line in sorted(lines)])
+
+    def counted_compute(self) -> str:
+        """Return the range of the trials' training compute."""
+        counted = [float(trial["tflop"]) for trial in self._trials]
+        return f"{min(counted):.3g} to {max(counted):.3g} TFLOP"
+
+    def _count_claims(self, tables: Iterable[Table], mode: str, branch: str) -> str:
+        counts: dict[str, Counter[Verdict]] = {"": Counter(), f"{CONFOUNDED} ": Counter()}
+        for table in tables:
+            for mark, found in counts.items():
+                found.update(table.count_verdicts(mode, bool(mark), branch))
+        return (
+            "; ".join(f"{mark}{format_counts(found)}" for mark, found in counts.items() if found) or MISSING
+        )
+
+    def _count_significant(self, table: Table) -> str:
+        counts = [Counter[bool](), Counter[bool]()]
+        for row, *_, effect in table.list_effects(table.modes[0]):
+            counts[bool(row.confounded)][effect.verdict not in UNDECIDED] += 1
+        sound, apart = (f"{found[True]} of {found.total()}" for found in counts)
+        return f"{sound}; {CONFOUNDED} {apart}" if counts[1] else sound
+
+    def _find_table(self, name: str, joined: str = "") -> Table:
+        if name not in self.sources:
+            choices = ", ".join(sorted(self.sources)) or "none"
+            raise InputError(f"'{name}': results must be one of {choices}")
+        return self._regroup(name, (joined,)) if joined else self.sources[name].table
+
+    def _regroup(self, name: str, patterns: tuple[str, ...]) -> Table:
+        """Return a table with coarser clip groups, which takes seconds to compute, at most once."""
+        regroup = self.sources[name].regroup
+        if regroup is None:
+            return self.sources[name].table
+        if (name, patterns) not in self._regrouped:
+            self._regrouped[name, patterns] = regroup(patterns)
+        return self._regrouped[name, patterns]
