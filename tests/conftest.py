@@ -96,8 +96,7 @@ def _no_process_is_left() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _parse_once() -> None:
-    """OmegaConf parses each `${seed}` again, and Hydra each override thrice: most of a composition. Each
-    export parses the code of 500 operators: a third of its time."""
+    """OmegaConf parses each `${seed}` again, Hydra each override thrice, and each export 500 operators."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from torch.onnx._internal._lazy_import import onnxscript_apis
 

@@ -1,5 +1,3 @@
-"""Digests of the package's code, which all forked processes need and which take most of a second."""
-
 from memmlp.runs.environment import describe_sources
 
-describe_sources()
+describe_sources()  # of the package's code: most of a second, which forked processes share

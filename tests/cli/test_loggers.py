@@ -32,9 +32,6 @@ def test_what_could_not_be_shown_is_a_line_each(memmlp: Memmlp, tmp_path: Path, 
     ran = memmlp("loggers", "sync")
     assert ran.code == 1
     assert ran.err == f"memmlp: warning: run {'0' * 16} is not shown in fake: connection refused\n"
-
-
-def test_a_logger_that_there_is_not_is_refused(memmlp: Memmlp):
     assert one_line(memmlp("loggers", "sync", "--logger", "paper"), "paper", "mlflow", "tensorboard", "wandb")
 
 

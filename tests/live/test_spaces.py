@@ -52,9 +52,6 @@ def test_the_axes():
         # a turn to the left is about +Y in openxr (right-handed) and about -Y in unity (left-handed)
         turn = Rotation.from_rotvec([0, left_turn * np.pi / 2, 0]).as_matrix()
         np.testing.assert_allclose(space.convert_rotations_to_amass(turn) @ [0, 0, 1], LEFT, atol=1e-12)
-
-
-def test_an_unknown_space_is_refused():
     with pytest.raises(InputError, match="space=maya"):
         find_space("maya")
 

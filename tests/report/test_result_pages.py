@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from docs.results.make_pages import make_pages
+from docs.results.placeholders import SEARCHED
 from docs.results.table_page import KeptTable, shorten_remark
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import parse_csv
@@ -158,3 +159,12 @@ def test_bad_templates_are_one_line(sweep: Sweep, kept: KeptResults, template: s
         fill(template, source(sweep, kept))
     assert str(raised.value).startswith("README.md")
     assert "\n" not in str(raised.value)
+
+
+def test_a_search_has_networks_with_all_trials_and_their_compute():
+    template = {"t.md": "{{ searches(1, 5) }}"}
+    row = dict.fromkeys(SEARCHED, "x") | {"network": "a", "trial": "0", "MPJPE": "7", "tflop": "5"}
+    page = make_pages({}, template, [row, row | {"network": "late", "trial": "1"}])["t.md"]
+    assert ("| a | 7.00 | 7.00 | x" in page, "late" in page) == (True, False)
+    with pytest.raises(InputError, match="a 0: must have 5 TFLOP"):
+        make_pages({}, template, [row | {"tflop": "4"}])
