@@ -46,10 +46,9 @@ class OneStep(nn.Module):
 
     def forward(self, sparse: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Return rotations (1, 22, 6), positions (1, 22, 3) and the new state for `sparse` (1, 54)."""
-        motion, new = self.model.advance(sparse[:, None], dict(zip(self.names, state, strict=True)), 1)
-        last = motion[:, -1]
-        rotation = last[:, ROTATION].unflatten(-1, (N_JOINTS, 6))
-        position = last[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+        motion, new = self.model.advance_frame(sparse, dict(zip(self.names, state, strict=True)))
+        rotation = motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))
+        position = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
         return rotation, position, *(new[name] for name in self.names)
 
 

@@ -116,10 +116,11 @@ def _quantise_to_int8(
 ) -> None:
     """Write an int8 file by ONNX Runtime's static quantisation. `corrected` are prefixes of weights.
 
-    Weights have seven bits and one scale per output. CPUs without VNNI add products in sixteen bits, and
-    would overflow with eight-bit weights. Activations have eight bits and one scale, calibrated on streamed
-    clips.
+    Weights have seven bits and one scale per output, or one scale if they join several layers (ONNX Runtime
+    has no such product with more scales). CPUs without VNNI add products in sixteen bits, and would overflow
+    with eight-bit weights. Activations have eight bits and one scale, calibrated on streamed clips.
     """
+    joined = [tensor.name for tensor in onnx.load(source).graph.initializer if len(tensor.dims) == 3]
     unfinished, root = temporary_path(path), logging.getLogger()
     level = root.level
     root.setLevel(logging.ERROR)  # hide the advice to prepare the graph; torch's exporter did it already
@@ -136,7 +137,12 @@ def _quantise_to_int8(
                 reduce_range=True,  # seven bits
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
-                extra_options={"OpTypesToExcludeOutputQuantization": ["Gemm", "MatMul"]},
+                extra_options={
+                    "OpTypesToExcludeOutputQuantization": ["Gemm", "MatMul"],
+                    "TensorQuantOverrides": {
+                        name: [{"quant_type": QuantType.QInt8, "reduce_range": True}] for name in joined
+                    },
+                },
             )
             model = onnx.load(unfinished)
             _check_quantised(model, inner)

@@ -112,7 +112,8 @@ def _write_out_normalization(
     node: NodeProto, attributes: dict[str, Any], constants: GraphConstants
 ) -> Iterator[NodeProto]:
     """Yield the operators that replace a LayerNormalization before opset 17. Runtimes can fuse them."""
-    assert attributes.get("axis", -1) == -1
+    axes = list(range(attributes.get("axis", -1), 0))
+    assert axes
     name, x = node.output[0], node.input[0]
     epsilon = constants.add(f"{name}.epsilon", np.array(attributes.get("epsilon", 1e-5), np.float32))
     two = constants.add(f"{name}.two", np.array(2, np.float32))
@@ -121,10 +122,10 @@ def _write_out_normalization(
     def step(kind: str, inputs: list[str], output: str, **settings: Any) -> NodeProto:
         return helper.make_node(kind, inputs, [output], output, **settings)
 
-    yield step("ReduceMean", [x], f"{name}.mean", axes=[-1])
+    yield step("ReduceMean", [x], f"{name}.mean", axes=axes)
     yield step("Sub", [x, f"{name}.mean"], f"{name}.centred")
     yield step("Pow", [f"{name}.centred", two], f"{name}.squares")
-    yield step("ReduceMean", [f"{name}.squares"], f"{name}.variance", axes=[-1])
+    yield step("ReduceMean", [f"{name}.squares"], f"{name}.variance", axes=axes)
     yield step("Add", [f"{name}.variance", epsilon], f"{name}.safe")
     yield step("Sqrt", [f"{name}.safe"], f"{name}.deviation")
     yield step("Div", [f"{name}.centred", f"{name}.deviation"], f"{name}.normal")

@@ -117,11 +117,11 @@ class FullStep(nn.Module):
             torch.cat([torch.where(past[..., None], last_positions, positions), positions]),
         )
         before = dict(zip(self.names, state[len(OWN) :], strict=True))
-        motion, after = self.model.advance(sparse[:, None], before, 1)
+        motion, after = self.model.advance_frame(sparse, before)
         # The first frame does not have velocities. It gives a pose, but does not change the network's state,
         # like in training.
         kept = [after[name] * seen.view(-1, *[1] * (after[name].ndim - 1)) for name in self.names]
-        pose = self.convert_outputs(motion[:, -1], positions[:, 0])
+        pose = self.convert_outputs(motion, positions[:, 0])
         return *pose, seen.clamp_min(1), positions, rotations, *kept
 
     def convert_outputs(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:

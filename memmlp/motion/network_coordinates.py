@@ -26,6 +26,10 @@ class Coordinates:
         """Return the origin (..., 3), metres, of local coordinates for inputs (..., 54). Default: zeros."""
         return torch.zeros_like(sparse[..., :3])
 
+    def find_turn(self, sparse: Tensor) -> Tensor:
+        """Return the numbers that follow the position in the origin (..., 0 or 2)."""
+        return self.find_origin(sparse)[..., 3:]
+
     def convert_inputs_to_local(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """Convert world inputs (..., 54) to local coordinates."""
         return sparse - _place_points(origin, SPARSE_POSITION, SPARSE_DIM)
@@ -70,12 +74,16 @@ class Heading(HeadRelative):
 
     def find_origin(self, sparse: Tensor) -> Tensor:
         """Return (..., 5): the head's position on the floor, metres, and its heading's cosine and sine."""
+        return torch.cat([super().find_origin(sparse), self.find_turn(sparse)], -1)
+
+    def find_turn(self, sparse: Tensor) -> Tensor:
+        """Return the heading's cosine and sine (..., 2)."""
         # The rest pose has Y up and faces Z. Of the head's rotation R, whose first columns are a and b,
         # A = R Rx(-90 deg) is the rotation from upright. Its twist is atan2(A10 - A01, A00 + A11). Both
         # arguments are the horizontal part of a plus the horizontal part of a x b, rotated by 90 degrees.
         a, a_up, b, b_up = sparse[..., :6].split([2, 1, 2, 1], -1)
-        heading = F.normalize(a + (a * b_up - a_up * b), dim=-1)
-        return torch.cat([super().find_origin(sparse), heading], -1)
+        heading = a + (a * b_up - a_up * b)
+        return heading / heading.norm(dim=-1, keepdim=True).clamp_min(1e-12)
 
     def convert_inputs_to_local(self, sparse: Tensor, origin: Tensor) -> Tensor:
         rotated = [

@@ -139,21 +139,19 @@ def find_batch_dependent_layers(module: nn.Module) -> list[str]:
     return sorted({type(layer).__name__ for layer in layers})
 
 
-def compute_gate_products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what an input (B, n) and the hidden state (B, d) each add to a layer's gates.
-
-    Args:
-        weights: the layer's weights and biases, in the order of `nn.RNNBase.all_weights`.
-        x: the input.
-        hidden: the hidden state.
-    """
-    of_input, of_hidden, input_bias, hidden_bias = weights
-    return F.linear(x, of_input, input_bias), F.linear(hidden, of_hidden, hidden_bias)
-
-
 def step_gru(weights: Sequence[Tensor], x: Tensor, state: Tensor) -> Tensor:
-    """Return a GRU layer's new state (B, d) for an input (B, n) and a state (B, d), with plain layers."""
-    entering, again = (part.chunk(3, -1) for part in compute_gate_products(weights, x, state))
-    reset, keep = (torch.sigmoid(entering[gate] + again[gate]) for gate in range(2))
-    new = torch.tanh(entering[2] + reset * again[2])
+    """Return a GRU layer's new state (B, d) for an input (B, n) and a state (B, d), with plain layers.
+
+    `weights` are the layer's weights and biases, in the order of `nn.RNNBase.all_weights`.
+    """
+    of_input, of_state, input_bias, state_bias = weights
+    return apply_gru_gates(F.linear(x, of_input, input_bias), F.linear(state, of_state, state_bias), state)
+
+
+def apply_gru_gates(entering: Tensor, again: Tensor, state: Tensor) -> Tensor:
+    """Return a GRU's new state (..., d) for what the input and the state add to its gates (..., 3 d)."""
+    sizes = [2 * state.shape[-1], state.shape[-1]]
+    (gates, new), (gates_again, new_again) = entering.split(sizes, -1), again.split(sizes, -1)
+    reset, keep = torch.sigmoid(gates + gates_again).chunk(2, -1)
+    new = torch.tanh(new + reset * new_again)
     return new + keep * (state - new)

@@ -306,7 +306,7 @@ def place_elbows_and_wrists(
     axis = goal / distance
     most, least = (upper + lower) * (1 - REACH_MARGIN), (upper - lower).abs() + upper * REACH_MARGIN
     reach = distance.minimum(most).maximum(least)
-    cosine = reach / (2 * upper) + (upper.square() - lower.square()) / (2 * upper) / reach
-    sine = (1 - cosine.square()).clamp_min(1e-9).sqrt()
-    out = F.normalize(side - dot(side, axis) * axis, dim=-1)
-    return upper * (cosine * axis + sine * out), reach * axis
+    along = reach / 2 + (upper.square() - lower.square()) / 2 / reach
+    out = side - dot(side, axis) * axis
+    across = (upper.square() - along.square()).sqrt() / out.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    return along * axis + across * out, reach * axis

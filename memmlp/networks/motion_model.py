@@ -130,6 +130,11 @@ class MotionModel(nn.Module):
         """
         raise NotImplementedError
 
+    def advance_frame(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+        """Process one frame (B, 54); return its motion (B, 198) in the world, and the new state."""
+        motion, state = self.advance(sparse[:, None], state, 1)
+        return motion[:, -1], state
+
     def predict_clip(self, sparse: Tensor) -> Tensor:
         """Map a clip's world inputs (N, 54), N >= T, to its world motion (N, 198); see `takes_whole_clip`."""
         raise NotImplementedError
@@ -315,12 +320,17 @@ class StreamingGraph(nn.Module):
         Returns:
             Motion (1, 1, 198) in the world, and the new state.
         """
+        motion, state = self.advance_frame(sparse[0], state)
+        return motion[None], state
+
+    def advance_frame(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+        """Process one frame (1, 54); return its motion (1, 198) in the world, and the new state."""
         # An exported graph has no empty inputs, so empty parts of the state (a queue of 0 frames) are dropped
         # from the new state and put back from `windows` here.
         is_first_step = 1 - state["count"].clamp_max(1)
-        motion, kept = self.step(sparse[0], self.windows() | state, is_first_step)
+        motion, kept = self.step(sparse, self.windows() | state, is_first_step)
         kept["count"] = state["count"].clamp_max(self.frames - 1) + 1  # stops at T
-        return motion[None], {name: tensor for name, tensor in kept.items() if tensor.numel()}
+        return motion, {name: tensor for name, tensor in kept.items() if tensor.numel()}
 
     def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
         """Process one frame.

@@ -15,11 +15,11 @@ from memmlp.common.settings import at_least, one_of, setting, sized
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer, use_float32
-from memmlp.networks.layers import compute_gate_products, step_gru
+from memmlp.networks.layers import apply_gru_gates
 from memmlp.networks.limb_solver import bend_arms_to_trackers, use_tracker_rotations
-from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
+from memmlp.networks.motion_model import State, TrainingOutputs, WindowlessModel
+from memmlp.networks.recurrent_graph import RecurrentPoserGraph
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.streaming import OneFrameNormalizer
 
 SHORTEST, LONGEST = 0.9, 0.999
 """The smallest fraction of its state that an untrained LRU's first and last unit keep from frame to frame."""
@@ -28,8 +28,8 @@ SHORTEST, LONGEST = 0.9, 0.999
 class RecurrentCell(nn.Module):
     """The interface of recurrent cells, which have d inputs and d outputs.
 
-    `forward` processes a sequence, for training. `step` processes one frame, for live use. Both give equal
-    results.
+    `forward` processes a sequence, for training. `step` processes one frame of joined cells, for live use
+    (`memmlp.networks.recurrent_graph`). Both give equal results.
 
     Args:
         width: d.
@@ -52,7 +52,7 @@ class RecurrentCell(nn.Module):
         raise NotImplementedError
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Process one input (B, d) with a state; return the output (B, d) and the new state."""
+        """Process inputs (cells, 1, d) with states (cells, 1, carried x d); return outputs and new states."""
         raise NotImplementedError
 
 
@@ -68,7 +68,8 @@ class GRUCell(RecurrentCell):
         return outputs, after[0]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        state = step_gru(self.layer.all_weights[0], x, state)
+        entering, again = self.layer(x, state)
+        state = apply_gru_gates(entering, again, state)
         return state, state
 
 
@@ -88,7 +89,7 @@ class LSTMCell(RecurrentCell):
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         hidden, cell = state.chunk(2, -1)
-        entering, again = compute_gate_products(self.layer.all_weights[0], x, hidden)
+        entering, again = self.layer(x, hidden)
         enter, keep, new, show = (entering + again).chunk(4, -1)
         cell = torch.sigmoid(keep) * cell + torch.sigmoid(enter) * torch.tanh(new)
         hidden = torch.sigmoid(show) * torch.tanh(cell)
@@ -185,13 +186,16 @@ class RecurrentBlock(nn.Module):
         )
 
     def forward(self, h: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Map a sequence (B, n, d) or frame (B, d) to the same shape; return it and the new state."""
+        """Map a sequence (B, n, d) to the same shape; return it and the new state."""
         x = self.cell_norm(h)
-        if h.dim() == 2:
-            outputs, state = self.cell.step(x, state)
-        else:
-            with use_float32(h.device):  # a state adds up what bfloat16 rounds
-                outputs, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
+        with use_float32(h.device):  # a state adds up what bfloat16 rounds
+            outputs, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
+        h = h + outputs
+        return h + self.mlp(self.norm(h)), state
+
+    def step(self, h: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Map one frame of joined blocks (blocks, 1, d) to the same shape; return it and the new states."""
+        outputs, state = self.cell.step(self.cell_norm(h), state)
         h = h + outputs
         return h + self.mlp(self.norm(h)), state
 
@@ -217,7 +221,7 @@ class EnsembleMember(nn.Module):
         self.head = nn.Linear(width, ROTATION.stop)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Map encoded inputs (B, n, 54) or (B, 54) to rotations (..., 132) and the new state.
+        """Map encoded inputs (B, n, 54) to rotations (B, n, 132) and the new state.
 
         The names of the states, each (B, carried x d), are the blocks' names.
         """
@@ -235,29 +239,6 @@ def compute_mean_pose(normalizer: Normalizer) -> Tensor:
     local = sixd_to_matrix(normalizer.mean[SPARSE_DIM:][ROTATION].unflatten(-1, (N_JOINTS, 6)))
     rotations, _ = forward_kinematics(local, torch.zeros_like(normalizer.rest[0]), normalizer.rest)
     return matrix_to_sixd(rotations).flatten()
-
-
-class RecurrentPoserGraph(FrameGraph):
-    """RecurrentPoser's streaming graph: the network, with plain layers as cells for one frame.
-
-    When the graph is quantised, only the cells become int8. A cell's state averages rounding errors over many
-    frames, but rounding in the MLPs would show as jitter.
-    """
-
-    model: RecurrentPoser
-
-    def build(self, model: Any) -> None:
-        self.model = model
-        self.model.normalizer = OneFrameNormalizer(model.normalizer)
-        float32 = ["model.normalizer"]
-        for name, member in model.members.items():
-            parts = ["stem", *(f"blocks.{block}.mlp" for block in member.blocks), "head"]
-            float32 += [f"model.members.{name}.{part}" for part in parts]
-        self.float32_modules = tuple(float32)
-
-    def step(self, sparse: Tensor, state: State, is_first_step: Tensor) -> tuple[Tensor, State]:
-        rotations, kept = self.model.predict_members(sparse, state)
-        return self.model.pose(rotations.mean(0), sparse), kept
 
 
 @component("model", "recurrent_poser", version=3, builds="RecurrentPoser")
@@ -353,10 +334,10 @@ class RecurrentPoser(WindowlessModel):
             return self.normalizer.build_world_motion(rotations, sparse, bend_arms_to_trackers)
 
     def predict_members(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
-        """Return the rotations of each member (members, ..., 132), and the new state.
+        """Return the rotations of each member (members, B, n, 132), and the new state.
 
         Args:
-            sparse: world inputs (B, n, 54), or (B, 54) for one frame, which uses plain layers.
+            sparse: world inputs (B, n, 54).
             state: the state before these frames.
         """
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.find_origin(sparse))

@@ -114,30 +114,37 @@ class OneFrameNormalizer(Normalizer):
             padded = F.pad(x, (0, MOTION_DIM + 3 - ROTATION.stop))
             return decode(padded, turn)[:, ROTATION]
 
-        def turn_rotations(x: Tensor, turn: Tensor) -> Tensor:
-            return exact.convert_rotations_to_world(x, F.pad(turn.expand(len(x), -1), (3, 0)))
-
         self.encoder = OneFrameConversion(encode, SPARSE_DIM, turns)
         self.decoder = OneFrameConversion(decode, MOTION_DIM + 3, turns)
         self.rotation_decoder = OneFrameConversion(decode_rotations, ROTATION.stop, turns)
-        self.rotation_turner = OneFrameConversion(turn_rotations, ROTATION.stop, turns)
+        turned = [
+            exact.convert_rotations_to_world(torch.eye(6).double(), F.pad(turn, (3, 0)).expand(6, -1))
+            for turn in (torch.zeros(turns).double(), *torch.eye(turns).double())
+        ]
+        turned[1:] = [matrix - turned[0] for matrix in turned[1:]]
+        self.rotation_turner = nn.Parameter(torch.stack(turned)[:, :3, :3].flatten(1))
         self.to(normalizer.mean)
 
     def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """Convert world inputs (1, 54) to network space (1, 54)."""
-        return self.encoder(sparse, origin)
+        return self.encoder(sparse, with_one(origin[:, 3:]))
 
     def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert motion (1, 198) in network space to the world (1, 198)."""
-        return self.decoder(torch.cat([motion, origin[:, :3]], -1), origin)
+        return self.decoder(torch.cat([motion, origin[:, :3]], -1), with_one(origin[:, 3:]))
 
     def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
         """Convert joints' global rotations (1, 132), 6D, from the coordinates of an origin to the world."""
-        return self.rotation_turner(rotations, origin)
+        return self.turn_columns(rotations.view(-1, 3), with_one(origin[:, 3:])).view(1, -1)
+
+    def turn_columns(self, columns: Tensor, turn: Tensor) -> Tensor:
+        """Convert columns (n, 3) of global rotations to the world. `turn` (1, 1 or 3) is 1 and the origin's
+        turn."""
+        return columns @ (turn @ self.rotation_turner).view(3, 3)
 
     def decode_rotations(self, rotation: Tensor, sparse: Tensor) -> Tensor:
         """Make world motion (1, 198) from rotations (1, 132) in network space at world inputs (1, 54)."""
-        world = self.rotation_decoder(rotation, self.find_origin(sparse))
+        world = self.rotation_decoder(rotation, with_one(self.find_origin(sparse)[:, 3:]))
         motion = F.pad(world, (0, POSITION.stop - ROTATION.stop))
         return torch.cat([world, self.compute_positions(motion, sparse).flatten(-2)], -1)
 
@@ -165,11 +172,14 @@ class OneFrameConversion(nn.Module):
         self.weight = nn.Parameter(matrices.transpose(1, 2).reshape(self.parts * self.out, size))
         self.bias = nn.Parameter(offsets.reshape(-1))
 
-    def forward(self, x: Tensor, origin: Tensor) -> Tensor:
-        """Convert x (1, in) at an origin (1, 3 or 5) to (1, out)."""
-        products = F.linear(x, self.weight, self.bias).view(self.parts, self.out)
-        turn = torch.cat([torch.ones_like(origin[:, :1]), origin[:, 3:]], -1)
-        return turn @ products
+    def forward(self, x: Tensor, turn: Tensor) -> Tensor:
+        """Convert x (1, in) to (1, out); `turn` (1, 1 or 3) is 1 and the origin's turn."""
+        return turn @ F.linear(x, self.weight, self.bias).view(self.parts, self.out)
+
+
+def with_one(turn: Tensor) -> Tensor:
+    """Return a turn (1, n) after a 1: (1, 1 + n)."""
+    return torch.cat([torch.ones(1, 1).to(turn), turn], -1)
 
 
 class StemGraph(StreamingGraph):

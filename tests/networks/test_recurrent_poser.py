@@ -9,6 +9,7 @@ import torch
 from scipy.special import expit as sigmoid
 
 from memmlp.config.build import build_untrained
+from memmlp.deploy.export import export
 from memmlp.deploy.lower_precision import write_lower_precision
 from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.evaluation import modes as evaluation
@@ -103,6 +104,9 @@ def test_the_file_is_the_network_and_its_cells_become_int8(step_files, tmp_path)
     )
     assert measure_largest_difference(model, exact, CLIP) <= TOLERANCE
     write_lower_precision("int8", exact, int8, make_streaming_graph(model), [CLIP[:20]])
+    assert measure_largest_difference(model, int8, CLIP) < 0.2
+    export(make_streaming_graph(model), tmp_path / "old.onnx", "run", opset=15)
+    assert measure_largest_difference(model, tmp_path / "old.onnx", CLIP) <= TOLERANCE
     graph = onnx.load(int8).graph
     types = {tensor.name: tensor.data_type for tensor in graph.initializer}
     given = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}
