@@ -1,6 +1,7 @@
 """Pack a finished run as a shipped network, or cut the shipped clip. A maintainer's script, not a command.
 
     python models/pack.py network NAME RUN... --root DATA --title TITLE --command COMMAND
+    python models/pack.py export NAME --root DATA    # export the network again, with this code
     python models/pack.py latency NAME    # time the network again, on a quiet machine
     python models/pack.py clip FILE.npz --start SECONDS --seconds SECONDS
 
@@ -160,6 +161,29 @@ def summarize_latency(record: Mapping[str, Any]) -> dict[str, Any]:
     return {key: round(record[key], 4) for key in keys} | {"cpu": record["made_by"]["cpu"]}
 
 
+def list_files(run: Run) -> dict[str, Any]:
+    """Return the sizes and digests of a shipped network's files."""
+    files = [path for path in sorted(run.folder.rglob("*")) if path.suffix in (".onnx", ".safetensors")]
+    return {path.name: {"bytes": path.stat().st_size, "sha256": file_digest(path)} for path in files}
+
+
+def export_again(name: str, root: Path, outputs: Path) -> None:
+    """Export a shipped network again, time it, and update its card."""
+    run, path = Run(MODELS / name), MODELS / name / CARD
+    opened = open_run(outputs, str(run.folder), overrides=[f"data.root={root}"])
+    manifest = run.manifest_path.read_bytes()
+    shutil.rmtree(run.deployments)
+    with run.lock():
+        deploy_run(opened.experiment, run, opened.data)  # type: ignore[arg-type]
+    for lease in run.folder.glob(".lease*"):
+        lease.unlink()
+    run.manifest_path.write_bytes(manifest)
+    changes = {"clip": measure_clip(opened), "files": list_files(run)}
+    changes["latency"] = summarize_latency(run.preferred_deployment.record)
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes, indent=1) + "\n")
+    print(changes)
+
+
 def measure_latency(name: str) -> None:
     """Time a shipped network again on a quiet machine, and update its card."""
     run, path = Run(MODELS / name), MODELS / name / CARD
@@ -176,7 +200,6 @@ def make_card(opened: OpenedRun, title: str, command: str) -> dict[str, Any]:
     run, clips = opened.run, opened.data.manifest.clips  # type: ignore[union-attr]
     measured, record = load_measured_run(run.folder), run.preferred_deployment.record
     parts = {p: [c for c in clips if c.split == p] for p in ("train", "val", "test")}
-    files = [path for path in sorted(run.folder.rglob("*")) if path.suffix in (".onnx", ".safetensors")]
     config, manifest = run.config, run.manifest
     recipe = {key: config["optim"][key] for key in ("name", "batch", "lr", "warmup", "best_by")}
     recipe |= {
@@ -198,7 +221,7 @@ def make_card(opened: OpenedRun, title: str, command: str) -> dict[str, Any]:
         "errors": summarize_errors(measured),
         "clip": measure_clip(opened),
         "latency": summarize_latency(record),
-        "files": {path.name: {"bytes": path.stat().st_size, "sha256": file_digest(path)} for path in files},
+        "files": list_files(run),
         "weights": "matrices rounded to float16",
         "terms": TERMS,
     }  # fmt: skip
@@ -243,12 +266,14 @@ def main() -> None:
     """Parse the arguments, and pack."""
     parser = argparse.ArgumentParser()
     kinds = parser.add_subparsers(dest="kind", required=True)
-    network, clip, latency = (kinds.add_parser(kind) for kind in ("network", "clip", "latency"))
-    latency.add_argument("name")
+    network, clip, latency, export = map(kinds.add_parser, ("network", "clip", "latency", "export"))
+    for kind in (latency, export):
+        kind.add_argument("name")
+    for kind in (network, export):
+        kind.add_argument("--root", type=Path, required=True)
+        kind.add_argument("--outputs", type=Path, default=Path("outputs"))
     network.add_argument("name")
     network.add_argument("runs", nargs="+")
-    network.add_argument("--root", type=Path, required=True)
-    network.add_argument("--outputs", type=Path, default=Path("outputs"))
     network.add_argument("--title", required=True)
     network.add_argument("--command", required=True, help="the command of the training")
     clip.add_argument("source", type=Path)
@@ -259,6 +284,8 @@ def main() -> None:
         cut_clip(given.source, given.start, given.seconds)
     elif given.kind == "latency":
         measure_latency(given.name)
+    elif given.kind == "export":
+        export_again(given.name, given.root.resolve(), given.outputs)
     else:
         pack_network(given.runs, given.name, given.root.resolve(), given.outputs, given.title, given.command)
 
