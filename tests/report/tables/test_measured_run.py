@@ -73,6 +73,13 @@ def test_results_without_their_digest_are_refused(tmp_path: Path, keep: bool):
         load_measured_run(run.folder)
 
 
+def test_results_of_another_run_are_refused(tmp_path: Path):
+    path = (run := fake_run(tmp_path, "a")).evaluation("stream-0")
+    write_evaluation(path, json.loads(path.read_text()) | {"run": "b" * 16})
+    with pytest.raises(InputError, match="of another run"):
+        load_measured_run(run.folder)
+
+
 def test_clips_without_a_value_are_counted_at_the_number(tmp_path: Path, sweep: Sweep):
     find = fake_sweep(tmp_path, sweep)
     run = find(sweep.variants[3], 1)
