@@ -23,9 +23,9 @@ from memmlp.training.loop import TrainingTask, check_processes, train
 from memmlp.training.optim import Muon, Optim
 from memmlp.training.train_network import VQVAETask
 
-STEPS = replace(OPTIM, steps=14, checkpoint_every=6, validate_every=7)
+STEPS = replace(OPTIM, steps=10, checkpoint_every=4, validate_every=5)
 OPTIMS = {"muon": Muon(**asdict(replace(STEPS, ema=0.9)))}
-DEATH = 9  # the step at which the second process dies
+DEATH = 6  # the step at which the second process dies
 
 
 def optim_of(name: str) -> Optim:
