@@ -79,8 +79,8 @@ def largest_difference(network, file: Path) -> float:
 def test_it_is_evaluations_stream(network, file, undisturbed, step_files):
     assert largest_difference(network, file) < 1e-4
     np.testing.assert_allclose(undisturbed[:, HEAD], PERSON.positions[:, 0], atol=1e-6)
-    no_position_branch = exported.NETWORKS["avatar_poser"]()
-    assert largest_difference(no_position_branch, step_files("avatar_poser")) < 1e-4
+    no_position_branch = exported.NETWORKS["recurrent_poser"]()
+    assert largest_difference(no_position_branch, step_files("recurrent_poser")) < 1e-4
 
 
 CHANGING = np.concatenate([np.arange(0, 1, 1 / 90), np.arange(1, 2, 1 / 30), np.arange(2, 4, 1 / 120)])

@@ -230,7 +230,7 @@ def test_damaged_takes_are_one_line(tmp_path: Path, old: str, new: str, said: st
         read_amc(take)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "takes", "cuts"), [("cmu-asfamc", 142, CUTS), ("hdm05-asfamc", 233, {})])
 def test_the_databases_have_the_takes_and_cuts_of_their_readmes(
     database: Callable[[str], Path], tmp_path: Path, name: str, takes: int, cuts: dict[str, int]
