@@ -144,9 +144,9 @@ class Placeholders:
                 continue
             errors = sorted(float(one["MPJPE"]) for one in found[:trials])
             best = min(found[:trials], key=lambda one: float(one["MPJPE"]))
-            values = [best[column] for column in SEARCHED]
-            lines.append((errors[0], [network, f"{errors[0]:.2f}", f"{median(errors):.2f}", *values]))
-        heads = ["network", "best", "median", *(head.rpartition(".")[2] for head in SEARCHED)]
+            values = ", ".join(best[column] for column in SEARCHED)
+            lines.append((errors[0], [network, f"{errors[0]:.2f}", f"{median(errors):.2f}", values]))
+        heads = ["network", "best", "median", ", ".join(head.rpartition(".")[2] for head in SEARCHED)]
         return make_markdown_table(heads, [line for _, line in sorted(lines)])
 
     def counted_compute(self) -> str:
