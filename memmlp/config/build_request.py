@@ -44,10 +44,8 @@ def build_motion(config: Mapping[str, Any]) -> MotionSource:
         if generator.name == "puppet":
             folder = f"{settings['minutes']:g}min-seed{settings['seed']}"
         version = f"-v{generator.version}" if generator.version > 1 else ""
-        root, generate = (
-            Path(data["root"]) / f"{folder}{version}",
-            partial(_run_generator, generator, settings),
-        )
+        root = Path(data["root"]) / f"{folder}{version}"
+        generate = partial(_run_generator, generator, settings)
 
     interpolation = data.get("interpolation", LINES)  # old configs without the key used lines
     clips = ClipFolder(root, split, str(data["body"]), data["min_frames"], data["strict"], interpolation)
