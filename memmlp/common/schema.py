@@ -10,11 +10,15 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import yaml
 
+try:
+    from yaml import CSafeLoader as SafeLoader  # six times as fast
+except ImportError:
+    from yaml import SafeLoader  # type: ignore[assignment]
+
 MAX_DEPTH = 32  # nested lists and mappings
 MAX_ITEMS = 100_000  # of a list or mapping
 MAX_INT = 2**63
 SURROGATE = re.compile("[\ud800-\udfff]")
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the C loader is six times as fast
 NAMES = {
     str: "text", float: "a number", int: "a whole number", bool: "true or false", NoneType: "null",
     dict: "a mapping", list: "a list",
@@ -31,15 +35,22 @@ def parse_json(content: str | bytes) -> Any:
     return value
 
 
+def load_yaml(text: str, loader: Any, aliases: bool = True) -> Any:
+    """Return the content of a YAML text. Raises YAMLError, also if it is nested too deeply."""
+    if SURROGATE.search(text):
+        raise yaml.YAMLError("has text with a lone surrogate")
+    depth = 0
+    for event in yaml.parse(text, SafeLoader):  # before `load`: C code crashes on deep nesting
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH or (isinstance(event, yaml.AliasEvent) and not aliases):
+            raise yaml.YAMLError("has an alias, or is nested too deeply")
+    return yaml.load(text, loader)
+
+
 def parse_yaml(text: str) -> Any:
     """Parse YAML without aliases. Raises ValueError like `parse_json`."""
-    depth = 0
     try:
-        for event in yaml.parse(text, LOADER):  # before `load`: C code crashes on deep nesting
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH:
-                raise ValueError("has an alias, or is nested too deeply")
-        value = yaml.load(text, LOADER)
+        value = load_yaml(text, SafeLoader, aliases=False)
     except (yaml.YAMLError, OverflowError) as error:
         raise ValueError(str(error).splitlines()[0]) from None
     check_plain(value)
@@ -126,7 +137,7 @@ def _check_class(value: Any, kind: type, key: str) -> None:
         raise ValueError(f"{key or 'the file'} must be {NAMES[kind]}")
 
 
-class PlainYaml(yaml.SafeLoader):
+class PlainYaml(SafeLoader):
     """A safe YAML loader that rejects duplicate keys and reads scalars like Hydra's command line. Numbers,
     true, false and null have types. Everything else is the text as written, such as off, 010, 12:30 and
     1_000. Keys, and values of the keys in `TEXTS`, are always text. PyYAML's own rules are YAML 1.1's."""
@@ -162,7 +173,4 @@ for _tag, _pattern, _first in (
 
 def parse_config_yaml(text: str) -> Any:
     """Return the content of a YAML text; see `PlainYaml`. Raises YAMLError."""
-    try:
-        return yaml.load(text, PlainYaml)
-    except RecursionError:
-        raise yaml.YAMLError("nested too deeply") from None
+    return load_yaml(text, PlainYaml)

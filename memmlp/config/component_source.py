@@ -17,7 +17,7 @@ from memmlp.common.components import (
     list_component_names,
 )
 from memmlp.common.settings import SIZES
-from memmlp.config.schema import ONLY, SCHEMAS
+from memmlp.config.schema import ONLY, SCHEMAS, make_typed
 
 SCHEME = "components"
 SCHEMA = "schema"
@@ -71,17 +71,17 @@ class ComponentSource(ConfigSource):
 def _load_option(group: str, name: str) -> tuple[str | None, DictConfig]:
     """Return an option's Hydra package, None for the package of its group, and its config."""
     if group in (SCHEMA, *ONLY):
-        return None, OmegaConf.structured(SCHEMAS[name] if group == SCHEMA else ONLY[group])
+        return None, make_typed(SCHEMAS[name] if group == SCHEMA else ONLY[group])
     settings = find_component(group, name).settings
-    node: Any = OmegaConf.structured(settings)
+    node: Any = make_typed(settings)
     if group == "loggers":
         return f"loggers.{name}", node
-    others, keys = collect_attribute(settings, "defaults"), collect_attribute(settings, "recipe")
-    if not others and not keys:
+    others, recipe = collect_attribute(settings, "defaults"), collect_attribute(settings, "recipe")
+    if not others and not recipe:
         return None, node
     overrides = [{f"override /{slot}": option} for slot, option in others.items()]
     cfg = OmegaConf.create({"defaults": [*overrides, "_self_"], group: node})
-    for key, value in keys.items():
+    for key, value in recipe.items():
         OmegaConf.update(cfg, key, value)
     return "_global_", cfg
 

@@ -33,7 +33,7 @@ from memmlp.common.text_formats import join_command, keep_text, make_override
 from memmlp.config import plugins
 from memmlp.config.check import CheckedConfig, check, describe_unknown_key, explain_error
 from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register_components
-from memmlp.config.schema import Config
+from memmlp.config.schema import Config, make_typed
 
 VERSION_BASE = "1.3"
 CONFIG = "train"
@@ -260,7 +260,7 @@ def _make_node(slot: str, name: str) -> DictConfig | None:
     path = find_packaged_folder("conf") / slot / f"{name}.yaml"
     if not path.is_file():
         component = collect_components().get((slot, name))
-        return OmegaConf.structured(component.settings) if component else None
+        return make_typed(component.settings) if component else None
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     match content.pop("defaults", None):
         case [str(other), "_self_"] if (base := _make_node(slot, other)) is not None:

@@ -1,5 +1,7 @@
 """The keys of `memmlp train`'s config, with types and limits. Components declare their own keys."""
 
+import functools
+import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -319,11 +321,21 @@ ONLY = {
 """The groups with a single option, `default`."""
 
 
+def make_typed(schema: Any) -> Any:
+    """Return the typed config of a schema. It is a copy, which is quicker than a new config."""
+    return pickle.loads(_pickle_typed(schema))
+
+
+@functools.lru_cache(maxsize=256)
+def _pickle_typed(schema: Any) -> bytes:
+    return pickle.dumps(OmegaConf.structured(schema))
+
+
 def restore_config(config: Mapping[str, Any]) -> DictConfig:
     """Convert a run's recorded config to a typed config. Raises InputError for a component that no package in
     use declares, and OmegaConfBaseException, KeyError, TypeError or ValueError if it does not match this
     version's schema."""
-    cfg = OmegaConf.structured(Config)
+    cfg = make_typed(Config)
     for key, content in escape_interpolations(config).items():
         if not isinstance(content, Mapping):
             cfg[key] = content
@@ -344,7 +356,7 @@ def restore_config(config: Mapping[str, Any]) -> DictConfig:
 
 
 def _merge_typed(kind: Any, content: Mapping[str, Any]) -> Any:
-    return OmegaConf.merge(OmegaConf.structured(kind), content)
+    return OmegaConf.merge(make_typed(kind), content)
 
 
 def _choose_data_schema(content: Mapping[str, Any]) -> type:

@@ -120,7 +120,8 @@ def export_module(
 
 @contextmanager
 def silence_exporter() -> Iterator[None]:
-    """Suppress the exporter's warnings, because users cannot act on them."""
+    """Suppress the exporter's warnings and its nodes' stack traces, because users cannot act on them."""
+    traced, torch.fx.config.do_not_emit_stack_traces = torch.fx.config.do_not_emit_stack_traces, True
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -130,6 +131,7 @@ def silence_exporter() -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     finally:
+        torch.fx.config.do_not_emit_stack_traces = traced
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
 

@@ -16,6 +16,7 @@ from memmlp.deploy.opsets import NATIVE, OPSETS, convert_opset
 from memmlp.deploy.parity import TOLERANCE, stream_onnx
 
 CLIP = tiny.clip(20)
+OTHERS = ("lstm", "bodiffusion")
 
 
 def model(*nodes: onnx.NodeProto, **constants: np.ndarray) -> ModelProto:
@@ -29,7 +30,7 @@ def model(*nodes: onnx.NodeProto, **constants: np.ndarray) -> ModelProto:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "network",
-    ["mem_mlp", "hmd_poser", *(pytest.param(one, marks=pytest.mark.long) for one in ("lstm", "bodiffusion"))],
+    ["mem_mlp", "avatar_poser", *(pytest.param(name, marks=pytest.mark.long) for name in OTHERS)],
 )
 def test_a_step_computes_the_same_in_every_opset(step_files, tmp_path: Path, network: str):
     source, path = step_files(network), tmp_path / "step.onnx"

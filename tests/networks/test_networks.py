@@ -120,7 +120,7 @@ def test_a_network_without_a_streaming_graph_is_refused():
         make_streaming_graph(model)
 
 
-EXPORTED_ALONE = {*exported.BASELINES, "lstm", "refined"} - {"hmd_poser"}
+EXPORTED_ALONE = {*exported.BASELINES, "lstm", "refined"} - {"avatar_poser"}
 """Networks whose files no other test needs."""
 
 

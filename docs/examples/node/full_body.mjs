@@ -83,10 +83,11 @@ function isPose(pose) {
 }
 
 async function main([network, trackers]) {
+  const frames = readTrackers(trackers);
   ort.env.wasm.numThreads = 1; // quicker than more for so small a network
   const body = await FullBody.open(readFileSync(network));
   const rows = [JOINTS.flatMap((joint) => ["x", "y", "z"].map((axis) => `${joint}.${axis}`)).join()];
-  for (const frame of readTrackers(trackers)) {
+  for (const frame of frames) {
     const positions = frame.flatMap((pose) => pose.slice(0, 3));
     const made = await body.step(positions, frame.flatMap((pose) => matrix(pose.slice(3))));
     rows.push(Array.from(made.positions, (value) => value.toFixed(6)).join());

@@ -100,7 +100,7 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Write the joints of each frame."""
     asked = parser().parse_args()
-    body, trackers = FullBody(asked.network), read_trackers(asked.trackers)
+    trackers, body = read_trackers(asked.trackers), FullBody(asked.network)
     made = [body.step(frame[:, :3], matrices(frame[:, 3:])) for frame in trackers]
     motion = {name: np.stack([frame[name] for frame in made]) for name in made[0]}
     if asked.save:

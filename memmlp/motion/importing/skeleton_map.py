@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from memmlp.common.errors import InputError, describe_read_error
+from memmlp.common.schema import SafeLoader, load_yaml
 from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.formats.recording import END, Recording
 
@@ -73,8 +74,8 @@ def load_skeleton(which: str) -> SkeletonMap:
         names = ", ".join(list_shipped_skeletons())
         raise InputError(f"--skeleton {which}: must be one of {names}, or the path of a YAML map")
     try:
-        content = yaml.load(path.read_text("utf-8"), _StrictLoader)
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        content = load_yaml(path.read_text("utf-8"), _StrictLoader)
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise InputError(
             f"{path}: {describe_read_error(error)[:120]}; expected a readable YAML map"
         ) from error
@@ -171,7 +172,7 @@ def _normalize_name(name: str) -> str:
 # The YAML file
 
 
-class _StrictLoader(yaml.SafeLoader):
+class _StrictLoader(SafeLoader):
     """A YAML loader that raises ValueError for repeated keys."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:

@@ -57,6 +57,7 @@ def stage(browser: Browser) -> np.ndarray:
 
 
 def test_the_shipped_network_moves_without_arguments(browser: Browser, tmp_path: Path):
+    browser.size(480, 400)  # software draws what is small sooner
     line = [sys.executable, "-m", "memmlp.cli.main", "live", "--no-browser", "--port", "0"]
     with hearing_interrupts(), started(line, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process:
         browser.open(process.stdout.readline().split()[0])
@@ -65,7 +66,7 @@ def test_the_shipped_network_moves_without_arguments(browser: Browser, tmp_path:
 
 
 def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
-    browser.size(480, 400)  # software draws what is small sooner; the buttons are in it
+    browser.size(480, 400)
     browser.open(url)
     browser.wait(f"{SHOWN} > 20")
     picture = stage(browser)
