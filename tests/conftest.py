@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,6 +55,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_sessionfinish() -> None:
     """End the processes that a killed test process has left."""
     processes.end_all()
+
+
+def long_except(short: Iterable[object], names: Iterable[object]) -> list[object]:
+    """Parameters of which all but a few are long."""
+    return [name if name in short else pytest.param(name, marks=pytest.mark.long) for name in names]
 
 
 class Ran(NamedTuple):

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import click
 import pytest
 import yaml
+from conftest import long_except
 from own_package import PACKAGE, registers_kept
 
 from memmlp.cli.main import commands
@@ -75,9 +76,7 @@ START = [line for line in LINES if line.page == "README.md" or line.page.startsw
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "line", [line if line in START else pytest.param(line, marks=pytest.mark.long) for line in LINES], ids=str
-)
+@pytest.mark.parametrize("line", long_except(START, LINES), ids=str)
 def test_commands_are_valid(line: Line, on_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)

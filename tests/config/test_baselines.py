@@ -2,6 +2,7 @@
 
 import pytest
 import tiny
+from conftest import long_except
 
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
@@ -26,9 +27,7 @@ LARGE = ("bodiffusion", "avatar_jlm", "manikin_l", "sage")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long) if name in LARGE else name for name in PUBLISHED]
-)
+@pytest.mark.parametrize("name", long_except({*PUBLISHED} - {*LARGE}, PUBLISHED))
 def test_paper_profile_has_the_published_size(name, monkeypatch):
     monkeypatch.setattr("torch.nn.Linear.reset_parameters", lambda layer: None)
     monkeypatch.setattr("torch.Tensor.normal_", lambda tensor, *_, **options: tensor.zero_())

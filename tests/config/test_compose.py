@@ -186,13 +186,13 @@ def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
 
 
 @pytest.mark.parametrize("overrides", [
-    ["model.width=8", "seed=3"],
     ["model=bodiffusion", "refiner=sage", "profile=paper"],
     ["model=recurrent_poser", "loss=calm", "optim=adamw", "loggers=all"],
     ["hand='off'", "predictor=rotation_only", "memory=none", "loss=manual"],
     ["profile=tiny", "memory=gru", "experiment=no_memory", "optim.steps=4"],
     ["model=avatar_poser", "loss.position=2", "~loggers"],
     ["profile.width=16", "data.split.groups=[a,b]", "paths.outputs=elsewhere", "loggers=none"],
+    ["model.width=8", "seed=3"], ["optim=muon", "loss=kinematic", "model=rpm", "optim.lr=0.1"],
 ])  # fmt: skip
 def test_a_job_is_composed_as_hydra_composes_it(overrides):
     """Options of groups are chosen once for many jobs (twice here), and changes of one job are its own."""
@@ -203,3 +203,12 @@ def test_a_job_is_composed_as_hydra_composes_it(overrides):
             assert own == compose("train", list(overrides))
         assert OmegaConf.is_struct(own)
         own.model.frames, own.seed = 99, 99
+
+
+def test_hydra_composes_once_for_all_components(monkeypatch: pytest.MonkeyPatch):
+    composed: list[list[str]] = []
+    noted = lambda name, options: composed.append(options) or compose(name, options)  # noqa: E731
+    monkeypatch.setattr("memmlp.config.compose.compose", noted)
+    for options in (["model=rpm"], ["model=recurrent_poser", "optim=adamw"], ["memory=gru", "hand=off"]):
+        compose_config([*options, "loggers=all", "profile=paper"])
+    assert composed == [["loggers=all", "profile=paper", "~model"]]

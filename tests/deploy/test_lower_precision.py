@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 import tiny
+from conftest import long_except
 from onnx import TensorProto, numpy_helper
 
 from memmlp.common.errors import InputError
@@ -27,10 +28,7 @@ CLIP = tiny.clip(40)
 CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 
 
-@pytest.mark.parametrize(
-    "network",
-    ["mem_mlp", *(pytest.param(one, marks=pytest.mark.long) for one in ("refined", "avatar_poser", "sage"))],
-)
+@pytest.mark.parametrize("network", ["mem_mlp", *long_except([], ["refined", "avatar_poser", "sage"])])
 def test_every_layer_between_the_ends_is_an_inner_one(step_files, network: str):
     """By the weights' values, whatever the exporter calls them, and whether it transposes them or not."""
     stream, graph = make_streaming_graph(exported.NETWORKS[network]()), onnx.load(step_files(network))
@@ -50,7 +48,7 @@ def _is_of(constant: np.ndarray, weights: Iterable[np.ndarray]) -> bool:
     return any(np.array_equal(constant, one) or np.array_equal(constant, one.T) for one in weights)
 
 
-@pytest.mark.parametrize("network", ["mem_mlp", pytest.param("refined", marks=pytest.mark.long)])
+@pytest.mark.parametrize("network", ["mem_mlp", *long_except([], ["refined"])])
 def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, network: str):
     source, path = step_files(network), tmp_path / "half.onnx"
     stream = make_streaming_graph(exported.NETWORKS[network]())

@@ -7,6 +7,7 @@ import numpy as np
 import onnx
 import pytest
 import tiny
+from conftest import long_except
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from memmlp.common.errors import InputError
@@ -16,7 +17,6 @@ from memmlp.deploy.opsets import NATIVE, OPSETS, convert_opset
 from memmlp.deploy.parity import TOLERANCE, stream_onnx
 
 CLIP = tiny.clip(20)
-OTHERS = ("lstm", "bodiffusion")
 
 
 def model(*nodes: onnx.NodeProto, **constants: np.ndarray) -> ModelProto:
@@ -28,10 +28,7 @@ def model(*nodes: onnx.NodeProto, **constants: np.ndarray) -> ModelProto:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "network",
-    ["mem_mlp", "avatar_poser", *(pytest.param(name, marks=pytest.mark.long) for name in OTHERS)],
-)
+@pytest.mark.parametrize("network", ["mem_mlp", "avatar_poser", *long_except([], ["lstm", "bodiffusion"])])
 def test_a_step_computes_the_same_in_every_opset(step_files, tmp_path: Path, network: str):
     source, path = step_files(network), tmp_path / "step.onnx"
     native = onnx.load(source)

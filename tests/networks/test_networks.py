@@ -8,6 +8,7 @@ import exported
 import pytest
 import tiny
 import torch
+from conftest import long_except
 
 from memmlp.common.components import find_component
 from memmlp.common.errors import InputError
@@ -120,18 +121,11 @@ def test_a_network_without_a_streaming_graph_is_refused():
         make_streaming_graph(model)
 
 
-EXPORTED_ALONE = {*exported.BASELINES, "lstm", "refined"} - {"avatar_poser"}
-"""Networks whose files no other test needs."""
+NEEDED = ("mem_mlp", "no_memory", "recurrent_poser", "avatar_poser")  # other tests need these files too
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "network",
-    [
-        pytest.param(name, marks=pytest.mark.long) if name in EXPORTED_ALONE else name
-        for name in exported.NETWORKS
-    ],
-)
+@pytest.mark.parametrize("network", long_except(NEEDED, exported.NETWORKS))
 def test_its_file_is_the_network_in_onnx_runtime(step_files: Callable[[str], Path], network: str):
     path, model = step_files(network), exported.NETWORKS[network]()
     assert measure_largest_difference(model, path, tiny.clip(20)) < 1e-4

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from conftest import long_except
 
 from memmlp.runs.lookup import list_runs
 from memmlp.training import train_network
@@ -23,9 +24,7 @@ CHAINS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "network", [*list(CHAINS)[:2], *(pytest.param(one, marks=pytest.mark.long) for one in list(CHAINS)[2:])]
-)
+@pytest.mark.parametrize("network", long_except(list(CHAINS)[:2], CHAINS))
 def test_every_kind_of_training_can_do_without_validation(memmlp, network):
     few = [f"{group}.steps=2" for group in ("optim", "vqvae")]
     few += [f"prerequisite.{part}.steps=2" for part in PARTS if network == "model=sage"]
