@@ -14,7 +14,6 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -78,6 +77,8 @@ def keep_text(override: str) -> str:
 
 def make_sqlite_url(path: Path) -> str:
     """Return the SQLAlchemy URL of an absolute path of an SQLite file."""
+    from urllib.parse import quote
+
     return f"sqlite:///{quote(str(path))}"
 
 

@@ -322,8 +322,14 @@ ONLY = {
 
 
 def make_typed(schema: Any) -> Any:
-    """Return the typed config of a schema. It is a copy, which is quicker than a new config."""
+    """Return the typed config of a schema. From the second call, it is a copy, which is quicker."""
+    if schema not in _made:
+        _made.add(schema)
+        return OmegaConf.structured(schema)
     return pickle.loads(_pickle_typed(schema))
+
+
+_made = set[Any]()
 
 
 @functools.lru_cache(maxsize=256)
