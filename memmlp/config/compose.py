@@ -236,11 +236,11 @@ def _compose_components(options: Sequence[str]) -> DictConfig | None:
     names = {"model": _find_default_model()}
     names |= {key: override.options[0] for key, override in chosen.items() if key in SLOTS}
     model = collect_components().get(("model", str(names["model"])))
-    if model is None:
+    if model is None or not (defaults := collect_attribute(model.settings, "defaults")).keys() <= {*SLOTS}:
         return None
     others = [override.text for key, override in chosen.items() if key not in SLOTS]
     cfg: DictConfig = pickle.loads(_compose_options(*others, "~model"))
-    for slot, name in {**collect_attribute(model.settings, "defaults"), **names}.items():
+    for slot, name in {**defaults, **names}.items():
         if name is None:
             cfg[slot] = None
         elif (slot != "model" and _has_defaults(slot, name)) or (node := _make_node(slot, name)) is None:
