@@ -165,6 +165,9 @@ def explain_error(error: Exception, overrides: Sequence[str]) -> str:
         return _explain_type_error(error, None)
     if isinstance(error, ConfigCompositionException):
         return _explain_composition(str(error))
+    null = next((override for override in overrides if re.fullmatch(r"[\w/]+=null", override)), None)
+    if null and "NoneType" in str(error):
+        return f"{null}: must be one of its options; ~{null.removesuffix('=null')} removes the group"
     reason = "a parent of the key is null" if isinstance(error, AssertionError) else _get_first_line(error)
     return f"{' '.join(overrides)}: cannot be composed: {reason}"
 

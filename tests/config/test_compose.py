@@ -88,6 +88,7 @@ BAD = {
         (["model.width=0"], ["model.width=0", "at least 1"]),
         (["optim.lr=nan"], ["optim.lr=nan", "above 0"]), (["optim.lr=inf"], ["optim.lr=inf", "above 0"]),
         (["memory.blend=1.5"], ["memory.blend=1.5", "at most 1 or sampled"]),
+        (["hand=null", "seed=1"], ["hand=null: must be one of its options; ~hand"]),
         (["memory.layers=[2,2]"], ["memory.layers=[2, 2]", "without repetitions"]),
         (["vqvae.steps=null", "vqvae.epochs=0"], ["vqvae.epochs=0", "above 0"]),
         (["memory.name=gru"], ["memory.name=gru", "vq"]),
