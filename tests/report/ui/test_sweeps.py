@@ -59,9 +59,8 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     assert (before["counts"], before["share"], before["remaining"]) == ({"done": 6}, 1.0, None)
     run = run_of(outputs, "gru", 2)
     run.marker.unlink()
-    lines = [
-        {"step": s, "phase": "train", "time": s / 100, "values": {"loss": 1}} for s in range(0, 1001, 100)
-    ]
+    steps = range(0, 1001, 100)
+    lines = [{"step": s, "phase": "train", "time": s / 100, "values": {"loss": 1}} for s in steps]
     run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     monkeypatch.setattr(Run, "activity", property(lambda self: None if self.done else "training"))
     sweeps = sweeps_of(outputs)
@@ -84,8 +83,10 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite
     found = describe(sweeps_of(outputs))
     assert (found["counts"], found["prerequisite_counts"]) == ({"trained": 1, "done": 5}, {"done": 1})
     assert found["tasks"] == 6
-    said = build_table.make_state_finder(plan)(sweep.list_runnable()[0], first.seed)
-    assert said == "trained, an evaluation or export is missing"
+    tell, variant = build_table.make_state_finder(plan), sweep.list_runnable()[0]
+    assert tell(variant, first.seed) == "trained, an evaluation or export is missing"
+    plan.get_run(first).manifest_path.write_text("{")
+    assert str(tell(variant, first.seed)).startswith("damaged: ")
 
 
 def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
