@@ -29,6 +29,7 @@ NETWORKS: dict[str, Callable[[], MotionModel]] = {
     "avatar_poser": partial(tiny.baseline, "avatar_poser", Heading(), depth=1),
 }
 """Few are relative to the heading, which adds the same hundred nodes to each graph."""
+NEEDED = ("mem_mlp", "no_memory", "recurrent_poser", "avatar_poser")  # by several tests
 
 
 def write(name: str, path: Path, space: str | None = None) -> None:

@@ -21,20 +21,13 @@ class Outer(TypedDict, total=False):
     name: Annotated[str, str.isalnum]
 
 
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        ({"inner": None, "rows": [{"x": 1}], "word": "nan", "name": "a1", "other": object}, None),
-        ({"inner": {"a": 1}, "word": 2}, None),
-        ([], "the file must be a mapping"),
-        ({"inner": {}}, "inner must have the key a"),
-        ({"inner": {"a": True}}, "inner.a must be a whole number"),
-        ({"rows": None}, "rows must be a list"),
-        ({"rows": [{"x": 1}, {"x": "1"}]}, "rows.1.x must be a number"),
-        ({"word": "inf"}, "word must be a number"),
-        ({"name": "../x"}, "name must be valid, but is '../x'"),
-    ],
-)
+@pytest.mark.parametrize(("value", "words"), [
+    ({"inner": None, "rows": [{"x": 1}], "word": "nan", "name": "a1", "other": object}, None),
+    ({"inner": {"a": 1}, "word": 2}, None), ([], "the file must be a mapping"),
+    ({"inner": {}}, "inner must have the key a"), ({"inner": {"a": True}}, "inner.a must be a whole number"),
+    ({"rows": None}, "rows must be a list"), ({"rows": [{"x": 1}, {"x": "1"}]}, "rows.1.x must be a number"),
+    ({"word": "inf"}, "word must be a number"), ({"name": "../x"}, "name must be valid, but is '../x'"),
+])  # fmt: skip
 def test_types(value: Any, words: str | None):
     if words is None:
         check_type(value, Outer)
@@ -43,13 +36,10 @@ def test_types(value: Any, words: str | None):
             check_type(value, Outer)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "[" * 100_000, "[" * 40 + "]" * 40, "NaN", "[1e999]", "[-Infinity]", f"[{10**30}]",
-        r'["\ud800"]', r'{"\ud800": 1}', f"[{'1,' * 100_000}1]",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("text", [
+    "[" * 100_000, "[" * 40 + "]" * 40, "NaN", "[1e999]", "[-Infinity]", f"[{10**30}]", r'["\ud800"]',
+    r'{"\ud800": 1}', f"[{'1,' * 100_000}1]",
+])  # fmt: skip
 def test_values_that_no_reader_expects_are_no_json(text: str):
     with pytest.raises(ValueError, match=r".+"):
         parse_json(text)

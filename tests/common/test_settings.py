@@ -8,18 +8,12 @@ import pytest
 from memmlp.common.settings import each, existing, existing_clip_folders, one_of, setting, sized, text, within
 
 
-@pytest.mark.parametrize(
-    ("rule", "allowed", "refused"),
-    [
-        (one_of("a", "b"), ["a"], ["c", None]),
-        (within(0, 1), [0, 1, 0.5], [-0.1, 1.1, float("nan"), True, "a"]),
-        (within(0, 1, "sampled"), [0.5, "sampled"], ["other"]),
-        (within(0, strict=True), [0.1], [0, float("inf")]),
-        (each(within(1)), [[1, 2]], [[], [0], [1, 1], [[1]]]),
-        (each(empty=True), [[], ["a"]], [["a", "a"]]),
-        (text(), ["a"], ["", " "]),
-    ],
-)
+@pytest.mark.parametrize(("rule", "allowed", "refused"), [
+    (one_of("a", "b"), ["a"], ["c", None]), (text(), ["a"], ["", " "]),
+    (within(0, 1), [0, 1, 0.5], [-0.1, 1.1, float("nan"), True, "a"]),
+    (within(0, 1, "sampled"), [0.5, "sampled"], ["other"]), (each(empty=True), [[], ["a"]], [["a", "a"]]),
+    (within(0, strict=True), [0.1], [0, float("inf")]), (each(within(1)), [[1, 2]], [[], [0], [1, 1], [[1]]]),
+])  # fmt: skip
 def test_a_rule_allows_what_its_words_say(rule, allowed, refused):
     assert [rule.allows(value) for value in allowed] == [True] * len(allowed)
     assert [rule.allows(value) for value in refused] == [False] * len(refused)

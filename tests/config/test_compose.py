@@ -178,6 +178,14 @@ def test_a_config_file_that_hydra_would_misread_is_refused(
     assert one_line(memmlp("train", "--config-dir", "mine", *choice), *words)
 
 
+def test_limits_include_their_ends():
+    ones = [
+        f"profile.{key}=1" for key in ("steps", "batch", "checkpoint_every", "validate_every", "log_every")
+    ]
+    ones += ["profile.evaluation_batch=1", "vqvae.codes=1", "vqvae.width=1", "vqvae.encoder_depth=0"]
+    assert compose_config([*ones, "vqvae.decoder_depth=0", "vqvae.commitment=0"]).vqvae.codes == 1
+
+
 def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
     for words in (["optim.lr=-1"], ["--cfg", "job"], ["--help"]):
         ran = memmlp("train", "experiment=no_codes", "experiment=manual_weights", *words)

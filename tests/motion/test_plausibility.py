@@ -154,18 +154,15 @@ def turn_legs(clip: Clip) -> Clip:
     return replace(clip, poses=poses)
 
 
-@pytest.mark.parametrize(
-    ("activity", "change", "said"),
-    [
-        ("walking", lambda clip: replace(clip, fps=120.0), "so the frame rate 120 Hz may be about twice"),
-        ("running", lambda clip: replace(clip, fps=120.0), "faster than people step"),
-        ("walking", lambda clip: replace(clip, fps=15.0), "slower than people step"),
-        ("jumping", lambda clip: replace(clip, fps=120.0), "times the acceleration of gravity"),
-        ("jumping", lambda clip: replace(clip, fps=30.0), "too low"),
-        ("walking", exchange_legs, "left and right legs may be swapped"),
-        ("walking", turn_legs, "the feet point backward relative to the pelvis"),
-    ],
-)
+@pytest.mark.parametrize(("activity", "change", "said"), [
+    ("walking", lambda clip: replace(clip, fps=120.0), "so the frame rate 120 Hz may be about twice"),
+    ("running", lambda clip: replace(clip, fps=120.0), "faster than people step"),
+    ("walking", lambda clip: replace(clip, fps=15.0), "slower than people step"),
+    ("jumping", lambda clip: replace(clip, fps=120.0), "times the acceleration of gravity"),
+    ("jumping", lambda clip: replace(clip, fps=30.0), "too low"),
+    ("walking", exchange_legs, "left and right legs may be swapped"),
+    ("walking", turn_legs, "the feet point backward relative to the pelvis"),
+])  # fmt: skip
 def test_a_fault_is_named_and_the_sound_clip_is_not(activity: str, change, said: str):
     clip = synthesize_clip(activity, 1, seconds=8.0)
     assert list(find_faults(clip)) == []

@@ -121,11 +121,8 @@ def test_a_network_without_a_streaming_graph_is_refused():
         make_streaming_graph(model)
 
 
-NEEDED = ("mem_mlp", "no_memory", "recurrent_poser", "avatar_poser")  # other tests need these files too
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("network", long_except(NEEDED, exported.NETWORKS))
+@pytest.mark.parametrize("network", long_except(exported.NEEDED, exported.NETWORKS))
 def test_its_file_is_the_network_in_onnx_runtime(step_files: Callable[[str], Path], network: str):
     path, model = step_files(network), exported.NETWORKS[network]()
     assert measure_largest_difference(model, path, tiny.clip(20)) < 1e-4

@@ -123,18 +123,15 @@ def test_no_other_name_is_unpacked(archive: Path, tmp_path: Path):
     assert list(tmp_path.rglob("*evil*")) == []
 
 
-@pytest.mark.parametrize(
-    ("files", "words"),
-    [
-        ({"model.safetensors": b"WEIGHTS"}, "missing or changed files: model.safetensors"),
-        ({"manifest.json": b"{}"}, "must contain a finished run"),
-        ({"manifest.json": b'{"id": "0123456789abcdef", "attempts": 5}'}, "attempts must be a list"),
-        ({"config.yaml": b"a: &a {b: *a}"}, "config.yaml: cannot be read .has an alias"),
-        ({"metrics.jsonl": b'{"step": 1, "phase": [], "time": 1, "values": {}}\n'}, "phase must be text"),
-        ({"DONE": b'{"id": "0123456789abcdef", "artifacts": {"../../x": "0"}}'}, "artifacts must be valid"),
-        ({f"evaluations/e{n}.json": b"{}" for n in range(1000)}, "at most 1000 files"),
-    ],
-)
+@pytest.mark.parametrize(("files", "words"), [
+    ({"model.safetensors": b"WEIGHTS"}, "missing or changed files: model.safetensors"),
+    ({"manifest.json": b"{}"}, "must contain a finished run"),
+    ({"manifest.json": b'{"id": "0123456789abcdef", "attempts": 5}'}, "attempts must be a list"),
+    ({"config.yaml": b"a: &a {b: *a}"}, "config.yaml: cannot be read .has an alias"),
+    ({"metrics.jsonl": b'{"step": 1, "phase": [], "time": 1, "values": {}}\n'}, "phase must be text"),
+    ({"DONE": b'{"id": "0123456789abcdef", "artifacts": {"../../x": "0"}}'}, "artifacts must be valid"),
+    ({f"evaluations/e{n}.json": b"{}" for n in range(1000)}, "at most 1000 files"),
+])  # fmt: skip
 def test_a_hostile_archive_is_refused(archive: Path, tmp_path: Path, files: dict[str, bytes], words: str):
     refused(changed(archive, files), tmp_path / "there", words)
 

@@ -113,3 +113,5 @@ def test_the_keys_that_differ_without_neutral_ones():
     ))  # fmt: skip
     assert list_differing_keys([vq, none]) == ["memory"]
     assert list_differing_keys([vq, none, other]) == ["memory", "memory.layers"]
+    roots = [{"data": {"name": "mine", "root": root}, "force": root == "a"} for root in "ab"]
+    assert list_differing_keys(roots, ["0", "1"]) == ["data.root"]

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import long_except
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest
@@ -59,7 +58,7 @@ def test_files_and_persons_are_those_of_the_card(name: str, tmp_path: Path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", long_except(["recurrent_poser"], NAMES))
+@pytest.mark.parametrize("name", [pytest.param("mem_mlp", marks=pytest.mark.long), "recurrent_poser"])
 def test_errors_on_the_clip_are_those_of_the_card(name: str, tmp_path: Path):
     """Of torch and of ONNX Runtime."""
     opened = open_existing_run(find_run(tmp_path, name))

@@ -3,12 +3,14 @@
 import copy
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
 from tiny_tasks import motion_task, weights
 from torch import nn
 
+from memmlp.common.errors import InputError
 from memmlp.runs.run import Run
 from memmlp.training.loop import train
 from memmlp.training.optim import (
@@ -79,6 +81,11 @@ def test_the_weights_that_are_validated_are_kept(name: str, averaged: bool, tmp_
     train(task, optim, run, 0, "validate")
     assert torch.equal(seen[-1], task.model.stem.weight)
     assert torch.equal(seen[-1], weights(run)["module.model.stem.weight"]) is not averaged
+
+
+def test_schedule_free_needs_its_package():
+    with patch("memmlp.training.optim.find_spec", return_value=None), pytest.raises(InputError, match="pip "):
+        OPTIMS["schedule_free"].build([])
 
 
 def test_muon_has_the_matrices_and_adamw_the_rest():

@@ -64,7 +64,9 @@ def test_the_mannequin_moves_with_the_joints(glb: Glb):
     owner = glb.array(attributes["JOINTS_0"])[:, 0]
     assert set(owner) == set(range(22)) - {JOINTS.index("left_foot"), JOINTS.index("right_foot")}
     still = np.stack([glb.matrices(None)[joint][:3, 3] for joint in JOINTS])[owner]
-    reach = np.linalg.norm(glb.array(attributes["POSITION"]) - still, axis=1)
+    away = glb.array(attributes["POSITION"]) - still
+    assert ((away * glb.array(attributes["NORMAL"])).sum(1) > 0).mean() > 0.95  # normals are outward
+    reach = np.linalg.norm(away, axis=1)
     for frame in (0, 17, len(CLIP) - 1):
         moved = JOINTS_Y_UP[frame][owner]
         np.testing.assert_allclose(np.linalg.norm(glb.vertices(frame) - moved, axis=1), reach, atol=1e-5)

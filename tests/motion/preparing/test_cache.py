@@ -13,7 +13,8 @@ import torch
 from processes import forked
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import PARENTS, make_builtin_rest_joints
+from memmlp.common.files import write_json
+from memmlp.motion.body import PARENTS, RECORD, describe_body, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.formats.npz import read_clip, write_clip
@@ -71,6 +72,9 @@ def test_bad_files_are_skipped_with_a_reason_or_stop(root, tmp_path):
     with pytest.raises(InputError, match="npz"):
         prepare_cache(source(root, strict=True), tmp_path / "strict")
     assert not (tmp_path / "strict" / "manifest.json").exists()
+    write_json(root / RECORD, describe_body("tall.npz", 1.1 * make_builtin_rest_joints()))
+    with pytest.raises(InputError, match=r"tall\.npz.*data\.body"):
+        prepare_cache(source(root), tmp_path / "cache")
 
 
 def test_unchanged_sources_are_not_read_again(root, tmp_path, monkeypatch):

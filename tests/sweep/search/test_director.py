@@ -95,6 +95,9 @@ def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path:
 def test_a_failed_run_fails_its_trial_and_the_search_goes_on(tmp_path: Path):
     study = fake_search.open_study(tmp_path)
     one = fake_search.director(study, tmp_path)
+    one.check = Mock(side_effect=[InputError("the clips have changed"), *[None] * 9])
+    with pytest.raises(InputError, match="have changed"):
+        one.update(1)
     fake_search.begun(one.update(1)).fail("the loss is nan")
     fake_search.to_the_end(study, tmp_path)
     assert study.trials[0].state == TrialState.FAIL
