@@ -85,7 +85,7 @@ BAD = {
         (["normalizer.coordinates=polar"], ["normalizer.coordinates=polar", "head_relative or world"]),
     ],
     "out of range": [
-        (["model.width=0"], ["model.width=0", "at least 1"]),
+        (["model.width=0"], ["model.width=0", "at least 1"]), (["profile.ema=0"], ["profile.ema=0", "above"]),
         (["optim.lr=nan"], ["optim.lr=nan", "above 0"]), (["optim.lr=inf"], ["optim.lr=inf", "above 0"]),
         (["memory.blend=1.5"], ["memory.blend=1.5", "at most 1 or sampled"]),
         (["hand=null", "seed=1"], ["hand=null: must be one of its options; ~hand"]),
@@ -109,9 +109,8 @@ BAD = {
         (["data=mocap", "data.root=.", "data.split.groups=[a,10_01]"], ["data.split.groups", "1001"]),
     ],
     "missing values": [
-        (["data=mocap"], ["data.root", "no value"]),
+        (["data=mocap"], ["data.root", "no value"]), (["~model.width"], ["model.width", "cannot be removed"]),
         (["data.root=${oc.env:NOT_SET}"], ["data.root", "NOT_SET"]),
-        (["~model.width"], ["model.width", "cannot be removed"]),
     ],
     "broken command lines": [
         (["--no-such-flag"], ["--no-such-flag"]), (["-m", "--cfg", "job"], ["--multirun, --cfg", "only one"]),
