@@ -70,8 +70,6 @@ def commands_of(path: Path) -> Iterator[Line]:
 
 LINES = sorted((line for page in PAGES for line in commands_of(page)), key=lambda line: not line.whole)
 LINES = list({line.text: line for line in reversed(LINES)}.values())  # whole ones have priority
-
-
 START = [line for line in LINES if line.page == "README.md" or line.page.startswith("docs/quickstart")]
 
 

@@ -138,13 +138,14 @@ def test_offsets_of_another_space_or_body_are_refused(tmp_path: Path):
     for space, rest, said in (
         ("openxr", REST, r"unity.*openxr"),
         ("unity", REST * 1.68 / 1.72, r"head or wrists are 3\.\d cm away"),
-        ("unity", wider(0.03), r"head or wrists are 2\.0 cm away"),
-        ("unity", wider(-0.03), r"head or wrists are 2\.0 cm away"),
+        *(("unity", wider(by), r"head or wrists are 2\.0 cm away") for by in (0.03, -0.03)),
     ):
         with pytest.raises(InputError, match=rf"me\.json: .*{said}"):
             wearer.read_calibration(tmp_path / "me.json", space, BodyTree(JOINTS, PARENTS, rest))
     near = BodyTree(JOINTS, PARENTS, wider(0.003))  # rounding
     assert wearer.read_calibration(tmp_path / "me.json", "unity", near).height == 1.815
+    with pytest.raises(InputError, match=r"floor=100\.5"):
+        wearer.make_wearer(BODY, floor=100.5)
 
 
 @pytest.mark.parametrize("content", [

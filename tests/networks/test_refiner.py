@@ -24,11 +24,11 @@ def test_it_corrects_the_networks_stream(name):
     expected = bare[:, ROTATION] + model.head(model.layers(bare[None, :, ROTATION])[0])[0]
     torch.testing.assert_close(made[:, ROTATION], expected)
     assert not torch.allclose(made[:, ROTATION], bare[:, ROTATION], atol=1e-3)
-    positions = bare[:, POSITION]
-    if name != "mem_mlp":
-        positions = model.normalizer.compute_positions(made, SPARSE[0]).flatten(1)
+    kinematic = model.normalizer.compute_positions(made, SPARSE[0]).flatten(1)
+    positions = bare[:, POSITION] if name == "mem_mlp" else kinematic
     torch.testing.assert_close(made[:, POSITION], positions)
     assert torch.equal(modes.predict_windows(model, [CLIP])[0], made)
+    assert model.running_state(SPARSE[:, : model.past_frames]).keys() == model.initial_state().keys()
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ from fake_table import SHIPPED, cell, printed
 from markdown_it import MarkdownIt
 
 from memmlp.report.tables.table import Cell, Effect, Table
-from memmlp.report.tables.table_text import FORMATS, MINUS, format_effect, format_value
+from memmlp.report.tables.table_text import FORMATS, MINUS, explain_marks, format_effect, format_value
 from memmlp.sweep.sweep_file import load_sweep
 
 
@@ -80,12 +80,12 @@ def test_every_format_keeps_any_label(tmp_path: Path):
     labels = ["off", "010", "[2]", "*", "-x", "a|b", "[red]:bug:", "$x$ & 5 %", "~/é😀", "a--b", "&amp;"]
     labels.append("</script>")
     path = tmp_path / "any.yaml"
-    path.write_text(
-        yaml.safe_dump({"variants": {label: [] for label in labels}}, allow_unicode=True, sort_keys=False)
-    )
+    content = {"variants": {label: [] for label in labels}}
+    path.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False))
     sweep = load_sweep(path)
     table = table_of(sweep, fake_sweep(tmp_path, sweep))
     assert [row.label for row in table.rows] == labels
+    assert explain_marks(table) == ""
     tokens = MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(FORMATS["md"](table))
     shown = {"".join(child.content for child in token.children or ()) for token in tokens}
     assert {*labels} <= shown
