@@ -20,7 +20,6 @@ import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +54,12 @@ def activate(names: Iterable[str] = ()) -> None:
 @functools.cache
 def list_installed() -> tuple[str, ...]:
     """Return the packages that installed distributions declare as entry points."""
+    files = (file for folder in sys.path for file in Path(folder).glob("*-info/entry_points.txt"))
+    readable = (file for file in files if os.access(file, os.R_OK))
+    if not any(f"[{GROUP}]".encode() in file.read_bytes() for file in readable):
+        return ()
+    from importlib import metadata  # takes 3 % of a short command's time
+
     return tuple(dict.fromkeys(entry.module for entry in metadata.entry_points(group=GROUP)))
 
 

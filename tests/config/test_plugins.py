@@ -4,7 +4,6 @@ import importlib
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -46,17 +45,15 @@ def write(folder: Path, files: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("how", ["overrides", "environment", "entry point"])
-def test_a_package_is_used_where_somebody_names_it(on_path: Path, how: str, monkeypatch: pytest.MonkeyPatch):
+def test_a_package_is_used_where_somebody_names_it(on_path: Path, how: str, tmp_path: Path, monkeypatch):
     if how == "environment":
         monkeypatch.setenv("MEMMLP_PLUGINS", f" {PACKAGE},")
     if how == "entry point":
-        entries = [EntryPoint("feet", PACKAGE, plugins.GROUP)]
-        monkeypatch.setattr(plugins.metadata, "entry_points", lambda group: entries if group else ())
-        plugins.list_installed.cache_clear()
-    try:
-        cfg = compose_config([*OWN[how != "overrides" :]])
-    finally:
-        plugins.list_installed.cache_clear()
+        write(tmp_path, {"feet-1.dist-info/entry_points.txt": f"[memmlp.plugins]\nfeet = {PACKAGE}\n"})
+        write(tmp_path, {"feet-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: feet\nVersion: 1\n"})
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.setattr(plugins, "list_installed", plugins.list_installed.__wrapped__)
+    cfg = compose_config([*OWN[how != "overrides" :]])
     assert (cfg.memory.name, cfg.term.name, list(cfg.evaluation.metrics)) == ("mean", "skate", ["FootSkate"])
 
 
