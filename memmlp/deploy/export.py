@@ -26,6 +26,7 @@ import torch
 from onnx_ir.passes import common
 from onnxscript.optimizer import fold_constants
 from torch import Tensor, nn
+from torch.fx import config as fx_config
 
 from memmlp import __version__
 from memmlp.common.files import naming_file
@@ -121,7 +122,8 @@ def export_module(
 @contextmanager
 def silence_exporter() -> Iterator[None]:
     """Suppress the exporter's warnings and its nodes' stack traces, because users cannot act on them."""
-    traced, torch.fx.config.do_not_emit_stack_traces = torch.fx.config.do_not_emit_stack_traces, True
+    traced = getattr(fx_config, "do_not_emit_stack_traces", False)  # older versions do not know it
+    fx_config.do_not_emit_stack_traces = True
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -131,7 +133,7 @@ def silence_exporter() -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     finally:
-        torch.fx.config.do_not_emit_stack_traces = traced
+        fx_config.do_not_emit_stack_traces = traced
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
 
