@@ -90,6 +90,7 @@ class Run:
     def __init__(self, folder: Path | str):
         self.folder = Path(folder)
         self.id = self.folder.name
+        self._kind: str | None = None
         self.config_path = self.folder / "config.yaml"
         self.manifest_path = self.folder / "manifest.json"
         self.metrics_path = self.folder / "metrics.jsonl"
@@ -387,7 +388,14 @@ class Run:
     @property
     def manifest(self) -> dict[str, Any]:
         """The facts about the run; empty before it began."""
-        return records.read(self.manifest_path, records.Manifest)
+        found = records.read(self.manifest_path, records.Manifest)
+        self._kind = found.get("kind")
+        return found
+
+    @property
+    def kind(self) -> str | None:
+        """What the run trained, which never changes; a list of many runs reads each manifest once."""
+        return self._kind or self.manifest.get("kind")
 
     @property
     def config(self) -> dict[str, Any]:

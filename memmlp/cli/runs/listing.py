@@ -140,7 +140,7 @@ def _join_ids(ids: Sequence[str]) -> str:
 
 def _is_finished_part(run: Run) -> bool:
     """Return whether a run is a finished VQ-VAE or network part, which has no results to list."""
-    return run.manifest.get("kind") not in (None, NETWORK) and run.done
+    return run.kind not in (None, NETWORK) and run.done
 
 
 def _sort_runs(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:
