@@ -24,6 +24,7 @@ TRIALS = "budget_trials.csv"
 SEARCHED = (
     "optim", "optim.lr", "optim.weight_decay", "optim.batch", "profile.scale", "data.mirror", "loss",
 )  # fmt: skip
+RECIPE = "recipe"  # the trial of a network's own optimiser settings; other trials have numbers
 Trial = Mapping[str, str]  # a line of TRIALS
 UNDECIDED = (Verdict.INCONCLUSIVE, Verdict.EQUIVALENT)
 
@@ -130,23 +131,27 @@ class Placeholders:
         return escape_markdown(join_first(texts))
 
     def searches(self, trials: int, tflop: float) -> str:
-        """Return a table of a search at equal compute, with the best of the first trials of each network.
-        Networks with fewer are left out. Raises InputError if a trial's compute differs from `tflop` by more
-        than 5 %."""
-        by_network: dict[str, list[Trial]] = {}
-        for trial in sorted(self._trials, key=lambda one: int(one["trial"])):
-            by_network.setdefault(trial["network"], []).append(trial)
+        """Return a table of a search at equal compute, with the best of the first random trials and the trial
+        of the network's own recipe. Networks that lack one of these are left out. Raises InputError if a
+        trial's compute differs from `tflop` by more than 5 %."""
+        wanted = [*map(str, range(trials)), RECIPE]
+        by_network: dict[str, dict[str, Trial]] = {}
+        for trial in self._trials:
+            if not 0.95 <= float(trial["tflop"]) / tflop <= 1.05:
+                raise InputError(f"{TRIALS}: {trial['network']} {trial['trial']}: must have {tflop} TFLOP")
+            by_network.setdefault(trial["network"], {})[trial["trial"]] = trial
         lines = []
         for network, found in by_network.items():
-            if bad := [one for one in found if not 0.95 <= float(one["tflop"]) / tflop <= 1.05]:
-                raise InputError(f"{TRIALS}: {network} {bad[0]['trial']}: must have {tflop} TFLOP")
-            if [int(one["trial"]) for one in found[:trials]] != list(range(trials)):
+            if not found.keys() >= {*wanted}:
                 continue
-            errors = sorted(float(one["MPJPE"]) for one in found[:trials])
-            best = min(found[:trials], key=lambda one: float(one["MPJPE"]))
+            counted = [found[name] for name in wanted]
+            errors = sorted(float(one["MPJPE"]) for one in counted)
+            best = min(counted, key=lambda one: float(one["MPJPE"]))
             values = ", ".join(best[column] for column in SEARCHED)
-            lines.append((errors[0], [network, f"{errors[0]:.2f}", f"{median(errors):.2f}", values]))
-        heads = ["network", "best", "median", ", ".join(head.rpartition(".")[2] for head in SEARCHED)]
+            cells = [network, f"{errors[0]:.2f}", f"{median(errors):.2f}", best["trial"], values]
+            lines.append((errors[0], cells))
+        names = ", ".join(column.rpartition(".")[2] for column in SEARCHED)
+        heads = ["network", "best", "median", "trial", names]
         return make_markdown_table(heads, [line for _, line in sorted(lines)])
 
     def counted_compute(self) -> str:

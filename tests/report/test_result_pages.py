@@ -164,7 +164,8 @@ def test_bad_templates_are_one_line(sweep: Sweep, kept: KeptResults, template: s
 def test_a_search_has_networks_with_all_trials_and_their_compute():
     template = {"t.md": "{{ searches(1, 5) }}"}
     row = dict.fromkeys(SEARCHED, "x") | {"network": "a", "trial": "0", "MPJPE": "7", "tflop": "5"}
-    page = make_pages({}, template, [row, row | {"network": "late", "trial": "1"}])["t.md"]
-    assert ("| a | 7.00 | 7.00 | x" in page, "late" in page) == (True, False)
+    own = row | {"trial": "recipe", "MPJPE": "6"}
+    page = make_pages({}, template, [row, own, row | {"network": "late"}])["t.md"]
+    assert ("| a | 6.00 | 6.50 | recipe | x" in page, "late" in page) == (True, False)
     with pytest.raises(InputError, match="a 0: must have 5 TFLOP"):
         make_pages({}, template, [row | {"tflop": "4"}])

@@ -1,7 +1,9 @@
 """The shipped sweep files: they load, their variants differ, and their paper values are those printed.
 paper_values.yaml has the printed values, transcribed apart from the sweeps."""
 
+import csv
 import functools
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,7 +60,10 @@ def test_tables_carry_their_number_and_the_printed_values():
             assert [label for label, _ in variants] == labels
 
 
-OF_NETWORKS = {"networks", "paper_size", "recurrent_poser", "smooth_motion", "table01", "table02", "table03"}
+OF_NETWORKS = {
+    "equal_compute", "networks", "paper_size", "recurrent_poser", "smooth_motion",
+    "table01", "table02", "table03",
+}  # fmt: skip
 """Sweeps whose labels name whole networks, with their losses and features."""
 OF_SEVERAL = {
     "no Multi-Head, no Memory-Block, Mem-MLP's loss": 2, "+ Mem-MLP's backbone": 4,
@@ -85,3 +90,22 @@ def test_a_row_that_changes_more_than_its_label_names_is_confounded():
                 changed = {key.split(".")[0] for key in keys} - {"evaluation", "seed"}
                 several = len(changed) > OF_SEVERAL.get(label, 1)
                 assert several == bool(variant.confounded), (path.stem, label, changed)
+
+
+def test_networks_at_equal_compute_have_the_settings_of_their_best_trials():
+    best: dict[str, dict[str, str]] = {}
+    with (FOLDER.parent / "docs/results/budget_trials.csv").open(newline="") as file:
+        trials = sorted(csv.DictReader(file), key=lambda one: float(one["MPJPE"]))
+    complete = {trial["network"] for trial in trials if trial["trial"] == "recipe"}
+    for trial in (one for one in trials if one["network"] in complete):
+        best.setdefault(trial["network"], trial)
+    keys = ("optim", "optim.lr", "optim.weight_decay", "optim.batch", "profile.scale", "data.mirror", "loss")
+    expected = [
+        [re.sub(r"_\d+$", "", network), *(yaml.safe_load(trial[key]) for key in keys)]
+        for network, trial in best.items()
+    ]
+    found = []
+    for variant in load_sweep(FOLDER / "equal_compute.yaml").variants:
+        if "evaluation.ik" not in (own := dict(text.split("=", 1) for text in variant.overrides or ())):
+            found.append([own.get("model", "mem_mlp"), *(yaml.safe_load(own[key]) for key in keys)])
+    assert sorted(found, key=str) == sorted(expected, key=str)
