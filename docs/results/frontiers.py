@@ -8,15 +8,13 @@ from io import BytesIO
 from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.report.tables.table import Table
-from memmlp.report.tables.table_text import (
-    add_unit,
-)
+from memmlp.report.tables.table_text import add_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COMPUTE, LATENCY = "tflop", "ms"
-MIN_RATIO = 1.1  # minimum ratio between two budgets of a frontier
+COMPUTE, LATENCY = "tflop", "ratio"
+MIN_RATIO = 1.1  # minimum ratio between the largest and the smallest cost of a frontier
 
 
 class Point(NamedTuple):
@@ -25,7 +23,7 @@ class Point(NamedTuple):
     Attributes:
         series: the network, whose variants with other budgets are on the same curve.
         label: the variant's label.
-        cost: training compute in TFLOP, or latency in ms.
+        cost: training compute in TFLOP, or a live step's time as a multiple of the yardstick's.
         mean, low, high: the error with its 95 % interval over seeds and clip groups; without an interval, all
             are the mean.
     """
@@ -38,10 +36,19 @@ class Point(NamedTuple):
     high: float
 
 
-def has_frontier(table: Table) -> bool:
-    """Return whether at least three variants have a known training compute, and it differs."""
-    known = [row.costs[COMPUTE] for row in table.rows if COMPUTE in row.costs]
-    return bool(table.measured_metrics) and len(known) > 2 and max(known) > MIN_RATIO * min(known)
+def list_costs(table: Table) -> list[str]:
+    """Return the costs of a table's frontiers: training compute if it differs, and latency.
+
+    Latency alone makes a frontier if it is a column and the training compute is equal. At least three
+    variants must have a known cost.
+    """
+    found = {}
+    for cost in LABELS if table.measured_metrics else ():
+        known = [row.costs[cost] for row in table.rows if cost in row.costs]
+        if len(known) > 2:
+            found[cost] = max(known) > MIN_RATIO * min(known)
+    wanted = found.get(COMPUTE) or (COMPUTE in found and LATENCY in table.metrics)
+    return [cost for cost, differs in found.items() if differs and wanted]
 
 
 def choose_metric(table: Table) -> str:
@@ -60,22 +67,22 @@ def list_points(table: Table, cost: str) -> Iterator[Point]:
 
 
 SHIFT = 1.015  # ratio of neighbouring networks' places, so that intervals at one budget do not overlap
-LABELS = {COMPUTE: "training compute [TFLOP]", LATENCY: "live latency of a step [ms]"}
+LABELS = {COMPUTE: "training compute [TFLOP]", LATENCY: "time of a live step / yardstick's"}
 
 
 def draw_frontiers(table: Table) -> bytes:
-    """Return a picture (SVG) of error against training compute and against latency, side by side."""
+    """Return a picture (SVG) of error against each of the table's costs (`list_costs`), side by side."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
-    points = {cost: list(list_points(table, cost)) for cost in LABELS}
+    points = {cost: list(list_points(table, cost)) for cost in list_costs(table)}
     names = sorted({point.series for found in points.values() for point in found})
     with rc_context({"svg.hashsalt": table.name, "font.size": 9}):
         figure = Figure(figsize=(9, 3.6), layout="constrained")
         first = None
         for number, (cost, found) in enumerate(points.items(), 1):
-            first = axes = figure.add_subplot(1, 2, number, sharey=first)
+            first = axes = figure.add_subplot(1, len(points), number, sharey=first)
             _draw_curves(axes, found, names, SHIFT if cost == COMPUTE else 1.0)
             axes.set_xscale("log", subs=[])
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
@@ -94,8 +101,9 @@ def _draw_curves(axes: Axes, points: Sequence[Point], names: Sequence[str], rati
     for name, group in itertools.groupby(points, key=lambda point: point.series):
         own = list(group)
         sides = [[one.mean - one.low for one in own], [one.high - one.mean for one in own]]
-        colour, shift = f"C{names.index(name) % 10}", ratio ** (names.index(name) - len(names) / 2)
+        place = names.index(name)
+        colour, shift = f"C{place % 10}", ratio ** (place - len(names) / 2)
         axes.errorbar(
             [shift * one.cost for one in own], [one.mean for one in own], sides, label=name, color=colour,
-            marker="o", markersize=4, capsize=2, linewidth=1.4,
+            marker="os^"[place // 10 % 3], markersize=4, capsize=2, linewidth=1.4,
         )  # fmt: skip

@@ -11,19 +11,21 @@ import csv
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import jinja2
 
 from docs.results.all_numbers import to_csv
-from docs.results.frontiers import draw_frontiers, has_frontier
+from docs.results.frontiers import draw_frontiers, list_costs
 from docs.results.placeholders import TRIALS, Placeholders, Trial
 from docs.results.table_page import FILES, KeptTable, list_all_remarks, make_page
 from memmlp.cli.results import make_kept_table
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.report.kept_results import load_kept_results
+from memmlp.report.tables.table import Table
 
 HERE = Path(__file__).parent
 MARK = "<!-- made by: docs/results/make_pages.py -->"
@@ -44,9 +46,9 @@ def make_pages(
     """
     for name in sorted({f"{one}.md" for one in sources} & templates.keys()):
         raise InputError(f"{name}: a template and a table's page have the same name; rename one of them")
-    made = {}
+    made, frontiers = {}, join_budgets(sources)
     for name, source in sorted(sources.items()):
-        made[f"{name}.md"] = f"{MARK}\n\n{make_page(name, source)}"
+        made[f"{name}.md"] = f"{MARK}\n\n{make_page(name, source, name in frontiers)}"
         made[f"{FILES}/{name}.csv"] = to_csv(source.by_clips)
     if sources:
         remarks = {name: list_all_remarks(source) for name, source in sorted(sources.items())}
@@ -56,9 +58,23 @@ def make_pages(
 
 
 def draw_pictures(sources: Mapping[str, KeptTable]) -> dict[str, bytes]:
-    """Return the pictures of all pages by file name: frontiers, where the training compute differs."""
-    tables = {name: source.table for name, source in sources.items() if has_frontier(source.table)}
-    return {f"{name}_frontier.svg": draw_frontiers(table) for name, table in tables.items()}
+    """Return the pictures of all pages by file name: the frontiers."""
+    return {f"{name}_frontier.svg": draw_frontiers(table) for name, table in join_budgets(sources).items()}
+
+
+def join_budgets(sources: Mapping[str, KeptTable]) -> dict[str, Table]:
+    """Return the tables of frontiers by page name.
+
+    Pages that differ only in the training compute have one, on the first page, with the variants of all.
+    """
+    first: dict[tuple[str, ...], str] = {}
+    joined: dict[str, Table] = {}
+    for name, source in sorted(sources.items()):
+        others = [text for text in source.kept.overrides if not text.startswith("optim.tflop=")]
+        page = first.setdefault((source.kept.sweep, *others), name)
+        rows = joined[page].rows if page in joined else ()
+        joined[page] = replace(source.table, rows=(*rows, *source.table.rows))
+    return {name: table for name, table in joined.items() if list_costs(table)}
 
 
 def _fill_template(name: str, text: str, placeholders: Mapping[str, object]) -> str:

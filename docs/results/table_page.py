@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from docs.results.frontiers import has_frontier
 from memmlp.common.text_formats import escape_markdown
 from memmlp.report.kept_results import KeptResults
 from memmlp.report.tables.flags import join_quoted
@@ -62,12 +61,13 @@ class KeptTable(NamedTuple):
         return {"all": self.table, **dict(zip(names, self.by_source, strict=True))}
 
 
-def make_page(name: str, source: KeptTable) -> str:
-    """Return a page: what was measured, one table of stream mode with the paper's values, and remarks."""
+def make_page(name: str, source: KeptTable, frontier: bool = False) -> str:
+    """Return a page: what was measured, one table of stream mode with the paper's values, and remarks; with
+    `frontier`, also the picture of it."""
     table = source.table
     parts = [f"# {escape_markdown(make_caption(table))}", " ".join(_describe_table(source))]
-    if has_frontier(table):
-        parts.append(f"![Error against compute and latency, with 95 % intervals]({name}_frontier.svg)")
+    if frontier:
+        parts.append(f"![Error against cost, with 95 % intervals]({name}_frontier.svg)")
     parts.append(_make_series_table(source) if _has_cells(table) else _make_short_table(source))
     if remarks := _list_number_remarks(table):
         parts.append("\n".join(f"- {shorten_remark(one)}" for one in remarks))

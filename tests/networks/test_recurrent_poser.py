@@ -15,7 +15,7 @@ from memmlp.deploy.parity import TOLERANCE, measure_largest_difference
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.recurrent_poser import CELLS, RecurrentCell, scan_linear_recurrence
+from memmlp.networks.recurrent_poser import CELLS, RecurrentCell
 from memmlp.networks.streaming import make_streaming_graph
 
 CLIP = tiny.clip(24)
@@ -129,34 +129,17 @@ def cell(name: str) -> tuple[RecurrentCell, torch.Tensor]:
 
 
 @pytest.mark.parametrize("length", [1, 2, 7, 8])
-def test_the_scan_is_the_recurrence(length):
-    random = np.random.default_rng(0)
-    keep, new = random.random((2, length, 3)), random.normal(size=(2, length, 3))
-    state = random.normal(size=(2, 3))
-    found = scan_linear_recurrence(*map(torch.tensor, (keep, new, state)))
-    for t in range(length):
-        state = keep[:, t] * state + new[:, t]
-        np.testing.assert_allclose(found[:, t], state, atol=1e-12)
-
-
+@pytest.mark.parametrize("name", ["mingru", "lru"])
 @torch.no_grad()
-def test_a_minimal_gru_is_its_equation():
-    """h = (1 - z) h + z W x with z = sigmoid(V x)."""
-    made, state = cell("mingru")
-    found, h = made(X, state)[0], state.numpy()
-    for t, x in enumerate(made.linear(X).numpy().swapaxes(0, 1)):
-        gate, new = np.split(x, 2, -1)
-        h = (1 - sigmoid(gate)) * h + sigmoid(gate) * new
-        np.testing.assert_allclose(found[:, t], h, atol=1e-12)
-
-
-@torch.no_grad()
-def test_a_linear_recurrent_unit_is_its_equation():
-    """h = a h + sqrt(1 - a^2) i x with a = exp(-softplus(decay) r), gates r and i by sigmoids."""
-    made, state = cell("lru")
-    found, h = made(X, state)[0], state.numpy()
-    for t, x in enumerate(made.linear(X).numpy().swapaxes(0, 1)):
-        r, i, new = np.split(x, 3, -1)
-        a = np.exp(-np.log1p(np.exp(made.decay.numpy())) * sigmoid(r))
-        h = a * h + np.sqrt(1 - a**2) * sigmoid(i) * new
+def test_a_linear_cell_is_its_equation(name, length):
+    """h = a h + new. mingru: a = 1 - z, new = z W x with z = sigmoid(V x). lru: a = exp(-softplus(decay) r),
+    new = sqrt(1 - a^2) i W x, with gates r and i by sigmoids."""
+    made, state = cell(name)
+    inputs = torch.randn(2, length, 4).double()
+    found, h = made(inputs, state)[0], state.numpy()
+    for t, x in enumerate(made.linear(inputs).numpy().swapaxes(0, 1)):
+        *gates, new = np.split(x, 2 if name == "mingru" else 3, -1)
+        gate, enter = map(sigmoid, (gates[0], gates[-1]))
+        keep = 1 - gate if name == "mingru" else np.exp(-np.log1p(np.exp(made.decay.numpy())) * gate)
+        h = keep * h + (1 if name == "mingru" else np.sqrt(1 - keep**2)) * enter * new
         np.testing.assert_allclose(found[:, t], h, atol=1e-9)

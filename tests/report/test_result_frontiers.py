@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from fake_runs import fake_run, table_of
 
-from docs.results.frontiers import draw_frontiers, has_frontier, list_points
+from docs.results.frontiers import draw_frontiers, list_costs, list_points
 from docs.results.make_pages import draw_pictures, make_pages
 from docs.results.table_page import KeptTable
 from memmlp.common.text_formats import parse_csv
@@ -40,7 +40,7 @@ def table(tmp_path: Path) -> Table:
 
 
 def test_points_are_the_cells_of_a_network_by_budget(table: Table):
-    assert has_frontier(table)
+    assert list_costs(table) == ["tflop"]
     points = list(list_points(table, "tflop"))
     assert [point.series for point in points] == ["Mem-MLP"] * 2 + ["RPM"] * 2 + ["VAE-HMD"] * 2
     assert [point.cost for point in points] == pytest.approx([5.05, 20.05] * 3)
@@ -52,21 +52,31 @@ def test_points_are_the_cells_of_a_network_by_budget(table: Table):
     assert rows["RPM, optim.tflop=5"].costs["seconds"] == 300
 
 
-def test_one_budget_or_an_unknown_one_is_no_frontier(table: Table):
-    rows = tuple(replace(row, costs={**row.costs, "tflop": 5.0}) for row in table.rows)
-    assert not has_frontier(replace(table, rows=rows))
-    assert not has_frontier(replace(table, rows=tuple(replace(row, costs={}) for row in table.rows)))
+def test_one_budget_needs_latencies_for_a_frontier(table: Table):
+    def with_costs(**costs: float) -> Table:
+        rows = [
+            replace(row, costs={key: x * 2**i for key, x in costs.items()})
+            for i, row in enumerate(table.rows)
+        ]
+        rows = [replace(row, costs=row.costs | {"tflop": 5.0} if costs else {}) for row in rows]
+        return replace(table, metrics=("MPJPE", "ratio"), rows=tuple(rows))
+
+    assert list_costs(with_costs(ratio=0.1)) == ["ratio"]
+    assert list_costs(with_costs(parameters=1)) == list_costs(with_costs()) == []
+    assert list_costs(replace(with_costs(ratio=0.1), metrics=("MPJPE",))) == []
 
 
 def test_the_page_has_a_picture_and_its_file_the_costs(table: Table):
-    """The picture is the same each time, with a line for each network."""
-    kept = KeptResults("budgets", (), {}, {})
-    sources = {"budgets": KeptTable(kept, table)}
+    """The picture is the same each time, with a line for each network. It joins pages by their budgets."""
+    halves = [replace(table, rows=tuple(row for row in table.rows if f"={n}" in row.label)) for n in (20, 5)]
+    both = [KeptResults("budgets", ("seed=1", f"optim.tflop={number}"), {}, {}) for number in (20, 5)]
+    sources = dict(zip(("budgets", "few"), map(KeptTable, both, halves), strict=True))
     made = make_pages(sources, {})
     assert "(budgets_frontier.svg)" in made["budgets.md"]
     costs = {(one["variant"], one["metric"]): one["mean"] for one in parse_csv(made["tables/budgets.csv"])}
     assert float(costs["RPM, optim.tflop=20", "tflop"]) == pytest.approx(20.05)
     assert costs["RPM, optim.tflop=20", "seconds"] == "300"
     (picture,) = draw_pictures(sources).values()
+    assert "_frontier.svg" not in made["few.md"]
     assert picture == draw_frontiers(table)
     assert len(set(re.findall(rb"<!-- (Mem-MLP|RPM|VAE-HMD) -->", picture))) == 3

@@ -11,7 +11,7 @@ import pytest
 
 from docs.results.make_pages import make_pages
 from docs.results.placeholders import SEARCHED
-from docs.results.table_page import KeptTable, shorten_remark
+from docs.results.table_page import KeptTable
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
@@ -97,13 +97,6 @@ def test_effects_are_listed_and_counted_with_joined_clips_too(sweep: Sweep, kept
     wide = made._replace(table=replace(made.table, smallest=small))
     assert fill('{{ decisions(["t"], "holds", above_margin=true) }}|', wide).splitlines()[-1] == "|"
     assert "Table 14 '2'" in fill('{{ decisions(["t"], "holds", above_margin=true) }}', made)
-
-
-def test_long_remarks_lose_their_list_of_variants():
-    text = "timed on a busy machine: 'a'"
-    assert shorten_remark(text) == text
-    assert shorten_remark(text + ", 'b'" * 40) == "timed on a busy machine ([variants](tables/remarks.json))"
-    assert shorten_remark("a: b" * 90) == "a: b" * 90
 
 
 def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResults):
