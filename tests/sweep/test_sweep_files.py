@@ -99,6 +99,6 @@ def test_networks_at_equal_compute_have_the_settings_of_their_best_trials():
     found = []
     for variant in load_sweep(FOLDER / "equal_compute.yaml").list_runnable():
         own = dict(text.split("=", 1) for text in variant.overrides)
-        if not own.keys() & {"evaluation.ik", "model.width"}:
+        if not own.keys() & {"evaluation.ik", "model.width", "optim.steps"}:
             found.append([own.get("model", "mem_mlp"), *(yaml.safe_load(own[key]) for key in keys)])
     assert sorted(found, key=str) == sorted(expected, key=str)
