@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from io import BytesIO
 from typing import TYPE_CHECKING, NamedTuple
 
-from memmlp.report.tables.table import Table
+from memmlp.report.tables.table import Row, Table
 from memmlp.report.tables.table_text import add_unit
 
 if TYPE_CHECKING:
@@ -37,18 +37,22 @@ class Point(NamedTuple):
 
 
 def list_costs(table: Table) -> list[str]:
-    """Return the costs of a table's frontiers: training compute if it differs, and latency.
+    """Return the costs of a table's frontiers: compute if a network has several budgets, and latency.
 
-    Latency alone makes a frontier if it is a column and the training compute is equal. At least three
-    variants must have a known cost.
+    Latency alone makes a frontier if it is a column and the training compute is known. At least three
+    variants must have a known latency, and it must differ.
     """
-    found = {}
-    for cost in LABELS if table.measured_metrics else ():
-        known = [row.costs[cost] for row in table.rows if cost in row.costs]
-        if len(known) > 2:
-            found[cost] = max(known) > MIN_RATIO * min(known)
-    wanted = found.get(COMPUTE) or (COMPUTE in found and LATENCY in table.metrics)
-    return [cost for cost, differs in found.items() if differs and wanted]
+    known = {cost: [row for row in table.rows if cost in row.costs] for cost in LABELS}
+    if not table.measured_metrics or not known[COMPUTE]:
+        return []
+    by_series = [
+        [row.costs[COMPUTE] for row in known[COMPUTE] if row.series == name]
+        for name in {row.series for row in known[COMPUTE]}
+    ]
+    budgets = any(max(found) > MIN_RATIO * min(found) for found in by_series)
+    times = [row.costs[LATENCY] for row in known[LATENCY]]
+    timed = len(times) > 2 and max(times) > MIN_RATIO * min(times) and (budgets or LATENCY in table.metrics)
+    return [COMPUTE] * budgets + [LATENCY] * timed
 
 
 def choose_metric(table: Table) -> str:
@@ -59,11 +63,18 @@ def choose_metric(table: Table) -> str:
 def list_points(table: Table, cost: str) -> Iterator[Point]:
     """Yield the places of the table's variants with a known cost, in its first mode, by series and cost."""
     mode, metric = table.modes[0], choose_metric(table)
-    for row in sorted(table.rows, key=lambda row: (row.series, row.costs.get(cost, 0.0))):
+    known = [(row, price) for row in table.rows if (price := find_cost(row, mode, cost)) is not None]
+    for row, price in sorted(known, key=lambda one: (one[0].series, one[1])):
         cell = row.cells[mode][metric]
-        if cost in row.costs and cell.mean is not None:
+        if cell.mean is not None:
             low, high = (cell.mean if one is None else one for one in (cell.low, cell.high))
-            yield Point(row.series, row.label, row.costs[cost], cell.mean, low, high)
+            yield Point(row.series, row.label, price, cell.mean, low, high)
+
+
+def find_cost(row: Row, mode: str, cost: str) -> float | None:
+    """Return a variant's cost: that of its column, which leaves out times of a busy machine, or its mean."""
+    cells = row.cells[mode]
+    return cells[cost].mean if cost in cells else row.costs.get(cost)
 
 
 SHIFT = 1.015  # ratio of neighbouring networks' places, so that intervals at one budget do not overlap
@@ -79,7 +90,7 @@ def draw_frontiers(table: Table) -> bytes:
     points = {cost: list(list_points(table, cost)) for cost in list_costs(table)}
     names = sorted({point.series for found in points.values() for point in found})
     with rc_context({"svg.hashsalt": table.name, "font.size": 9}):
-        figure = Figure(figsize=(9, 3.6), layout="constrained")
+        figure = Figure(figsize=(9, 3 + 0.08 * len(names)), layout="constrained")
         first = None
         for number, (cost, found) in enumerate(points.items(), 1):
             first = axes = figure.add_subplot(1, len(points), number, sharey=first)
@@ -90,7 +101,7 @@ def draw_frontiers(table: Table) -> bytes:
             axes.set(xlabel=LABELS[cost], ylabel=add_unit(choose_metric(table)))
             axes.grid(alpha=0.25)
         handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
         picture = BytesIO()
         figure.savefig(picture, format="svg", metadata={"Date": None})
     return picture.getvalue()

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
+from docs.results.frontiers import find_cost
 from docs.results.table_page import BRANCHES, KeptTable, make_markdown_table
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import escape_markdown
@@ -118,9 +119,8 @@ class Placeholders:
         """Return the variants of some tables that no other one beats in both a metric and a cost."""
         known = []
         for row in (row for name in names for row in self._find_table(name).rows):
-            cells = row.cells[mode]
-            price = cells[cost].mean if cost in cells else row.costs.get(cost)
-            if price is not None and (mean := cells[metric].mean) is not None:
+            price = find_cost(row, mode, cost)
+            if price is not None and (mean := row.cells[mode][metric].mean) is not None:
                 known.append((price, mean, row))
         best, texts = float("inf"), []
         for price, mean, row in sorted(known, key=lambda one: one[:2]):
