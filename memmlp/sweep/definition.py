@@ -141,7 +141,7 @@ class Sweep:
 
         Raises:
             InputError: for `paths.outputs`, which `--outputs` sets; for `save_predictions`; and for a key
-                that a variant sets, because the variant's value would win.
+                that a variant sets to a value, because that value would win.
         """
         keys = [parse_key(text) for text in overrides]
         if "paths.outputs" in keys:
@@ -151,7 +151,12 @@ class Sweep:
                 "save_predictions: the runs of a sweep would overwrite each other's predictions; "
                 "use memmlp eval RUN --save-predictions FOLDER"
             )
-        setters = {parse_key(text): one.label for one in self.list_runnable() for text in one.overrides or ()}
+        setters = {
+            parse_key(text): one.label
+            for one in self.list_runnable()
+            for text in one.overrides or ()
+            if not text.endswith("=null")  # the variant does without it, whatever the others have
+        }
         others, seeds = [], self.seeds
         for text, key in zip(overrides, keys, strict=True):
             if key == "seed":

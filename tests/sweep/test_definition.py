@@ -35,6 +35,12 @@ def test_a_key_that_a_variant_sets_is_refused_on_the_command_line():
     for override in ("memory.layers=[2]", "+memory.layers=[9]", "~hand"):
         with pytest.raises(InputError, match=r"variant '(two|no hand)' of sweep s already sets"):
             parse_sweep("s", content).with_overrides(["profile=tiny", override])
+    content["variants"]["two"] = ["memory.layers=null"]
+    sweep = parse_sweep("s", content).with_overrides(["memory.layers=[9]"])
+    assert [sweep.merge_overrides(one)[-1] for one in sweep.variants[::2]] == [
+        "memory.layers=null",
+        "memory.layers=[9]",
+    ]
     content["variants"]["two"] = content["variants"]["no hand"] = {"overrides": None}  # the paper's rows
     assert parse_sweep("s", content).with_overrides(["~hand"]).command_line == ("~hand",)
 
