@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from memmlp.common.text_formats import escape_markdown
 from memmlp.report.kept_results import KeptResults
-from memmlp.report.tables.flags import join_quoted
+from memmlp.report.tables.flags import join_first, join_quoted
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Cell, Row, Table
@@ -96,7 +96,10 @@ def _describe_table(source: KeptTable) -> Iterator[str]:
     runs = " and ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items() if count)
     groups = max((row.groups for row in table.rows), default=0)
     tested = f", tested on clips in {groups} groups" if groups else ""
-    yield f"`{make_command(kept)}`: {runs}{tested}."
+    others = join_first([f"`{one}`" for one in kept.splits if one])
+    yield f"`{make_command(kept)}`{f', and again with {others}' if others else ''}: {runs}{tested}."
+    if kept.splits:
+        yield "Test clips of these splits are pooled."
     if marks := explain_marks(table):
         yield f"Beside the paper's differences: {marks}."
     yield from (text for metric, text in TIME_COLUMNS.items() if metric in table.metrics)

@@ -56,13 +56,7 @@ def save_command(
     from memmlp.cli.table import load_shown_sweep
     from memmlp.common.files import make_json_safe
     from memmlp.config.compose_plan import find_sweep, is_path
-    from memmlp.report.kept_results import (
-        KeptResults,
-        list_overrides,
-        load_kept_results,
-        save_results,
-        shorten_paths,
-    )
+    from memmlp.report.kept_results import KeptResults, list_overrides, shorten_paths
     from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
     from memmlp.report.tables.measured_run import load_measured_run
 
@@ -85,7 +79,12 @@ def save_command(
     )
     if not kept.all_runs:
         raise InputError(f"sweep {name}: has no finished runs; run the sweep with: {kept.command}")
-    path = out / f"{stem or sweep.name}.json"
+    _save_over_fewer(out / f"{stem or sweep.name}.json", kept)
+
+
+def _save_over_fewer(path: Path, kept: KeptResults) -> None:
+    from memmlp.report.kept_results import load_kept_results, save_results
+
     if path.exists():
         try:
             kept.check_can_replace(load_kept_results(path))
@@ -93,6 +92,32 @@ def save_command(
             raise InputError(f"{path}: {error}; give another --name or --out, or remove the file") from None
     save_results(path, kept)
     click.echo(f"{path}: {kept.run_count} runs")
+
+
+@results.command("join")
+@click.argument("names", nargs=-1, required=True, metavar="NAME...")
+@click.option("--name", "stem", required=True, help="File name without suffix.")
+@click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Its data/ has the results.")
+def join_command(names: tuple[str, ...], stem: str, folder: Path) -> None:
+    """Join kept results of one sweep: of other seeds, or of other splits.
+
+    NAMEs are the names of their files. Test clips of splits with other persons (data.split.seed) are pooled,
+    so that differences are tested on the persons of all splits.
+    """
+    from memmlp.report.joined_results import join_results
+
+    parts = [_load_named(folder, name) for name in names]
+    _save_over_fewer(folder / "data" / f"{stem}.json", join_results(parts))
+
+
+def _load_named(folder: Path, name: str) -> KeptResults:
+    from memmlp.report.kept_results import load_kept_results
+
+    path = folder / "data" / f"{name}.json"
+    if not path.is_file():
+        found = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
+        raise InputError(f"{path}: no such results; must be one of: {found or '(nothing is kept)'}")
+    return load_kept_results(path)
 
 
 @results.command("show")
@@ -103,13 +128,8 @@ def save_command(
 def show(name: str, source: str | None, together: tuple[str, ...], folder: Path) -> None:
     """Print the table of kept results. NAME is the name of their file; no run is needed."""
     from memmlp.cli.table import print_tables
-    from memmlp.report.kept_results import load_kept_results
 
-    path = folder / "data" / f"{name}.json"
-    if not path.is_file():
-        names = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
-        raise InputError(f"{path}: no such results; must be one of: {names or '(nothing is kept)'}")
-    print_tables([make_kept_table(load_kept_results(path), source, together)])
+    print_tables([make_kept_table(_load_named(folder, name), source, together)])
 
 
 def make_kept_table(kept: KeptResults, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
@@ -124,6 +144,8 @@ def make_kept_table(kept: KeptResults, source: str | None = None, patterns: Sequ
 
     # With the command line's overrides, the table warns about changed data.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)
+    if kept.splits:  # variants without runs in all splits are left out
+        sweep = replace(sweep, variants=tuple(one for one in sweep.variants if one.label in kept.variants))
     flags: list[str] = []
     rounds = Rounds.from_json(kept.rounds) if kept.rounds else None
     other = flag_changed_rounds(rounds, sweep) if rounds else None

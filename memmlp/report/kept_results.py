@@ -41,6 +41,8 @@ class KeptResults:
         variants: the overrides of each variant by label.
         rounds: the seed rounds (`Rounds`) as JSON; None for a fixed number of seeds.
         flags: warnings about how the seeds were chosen.
+        splits: if the test clips of several splits are pooled, each split's override; "" for that of
+            `overrides`. The id of a pooled run is those of its trainings, with a plus between.
     """
 
     sweep: str
@@ -49,6 +51,7 @@ class KeptResults:
     variants: Mapping[str, tuple[str, ...]]
     rounds: Mapping[str, Any] | None = None
     flags: tuple[str, ...] = ()
+    splits: tuple[str, ...] = ()
 
     @property
     def command(self) -> str:
@@ -63,7 +66,7 @@ class KeptResults:
     @property
     def run_count(self) -> int:
         """The number of runs."""
-        return len({run.id for run in self.all_runs})
+        return len({name for run in self.all_runs for name in run.id.split("+")})
 
     @property
     def untrained_count(self) -> int:
@@ -98,7 +101,7 @@ class KeptResults:
         Raises:
             InputError: if the older results have other overrides, another sweep or additional runs.
         """
-        if (self.sweep, self.overrides) != (other.sweep, other.overrides):
+        if (self.sweep, self.overrides, self.splits) != (other.sweep, other.overrides, other.splits):
             raise InputError(f"contains results of '{other.command}', not of '{self.command}'")
         lost = [
             f"'{label}' seed {seed}"
@@ -167,6 +170,7 @@ def format_results(kept: KeptResults) -> str:
         "variants": {label: list(overrides) for label, overrides in sorted(kept.variants.items())},
         "rounds": kept.rounds,
         "flags": list(kept.flags),
+        **({"splits": list(kept.splits)} if kept.splits else {}),
         "clips": dict(
             sorted({_digest(_list_clips(run))[:8]: _list_clips(run) for run in kept.all_runs}.items())
         ),
@@ -200,7 +204,8 @@ def load_kept_results(path: Path) -> KeptResults:
         }
         variants = {label: tuple(texts) for label, texts in content["variants"].items()}
         overrides, flags = tuple(content["overrides"]), tuple(content["flags"])
-        return KeptResults(content["sweep"], overrides, cells, variants, content["rounds"], flags)
+        splits = tuple(content.get("splits", ()))
+        return KeptResults(content["sweep"], overrides, cells, variants, content["rounds"], flags, splits)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: damaged ({error}); write it again with memmlp results save") from None
 

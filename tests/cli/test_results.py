@@ -60,6 +60,16 @@ def test_one_kept_seed_of_three_is_no_finished_table(memmlp: Memmlp, planned: No
     assert page.read_text().count("| 4/4 |") == 4
 
 
+def test_kept_results_are_joined(memmlp: Memmlp, planned: None):
+    memmlp("results", "save", "14", "seed=0", "--name", "one")
+    memmlp("results", "save", "14", "seed=1,2", "--name", "two")
+    assert "table14.json: 12 runs" in memmlp("results", "join", "one", "two", "--name", "table14").out
+    saved = Path("docs/results/data/table14.json").read_bytes()
+    memmlp("results", "save", "14")
+    assert Path("docs/results/data/table14.json").read_bytes() == saved
+    assert one_line(memmlp("results", "join", "one", "tow", "--name", "x"), "tow.json", "must be one of: one")
+
+
 def test_pages_without_data_go(memmlp: Memmlp, planned: None):
     memmlp("results", "save", "14", "--name", "small")
     make_pages()

@@ -9,6 +9,7 @@ import pytest
 from fake_table import cell as find_cell
 
 from memmlp.common.errors import InputError
+from memmlp.report.joined_results import join_results
 from memmlp.report.kept_results import (
     KeptResults,
     format_results,
@@ -104,3 +105,50 @@ def test_results_of_a_variant_with_other_overrides_are_rejected(sweep: Sweep, ke
     other = [replace(one, overrides=("memory=gru",)) if one.label == "2" else one for one in sweep.variants]
     with pytest.raises(InputError, match="variant '2': overrides changed from"):
         kept.select_runs(replace(sweep, variants=tuple(other)))
+
+
+def select_seeds(kept: KeptResults, *seeds: int) -> KeptResults:
+    runs = {label: {seed: runs[seed] for seed in seeds} for label, runs in kept.runs.items()}
+    return replace(kept, runs=runs)
+
+
+def test_results_of_several_seeds_are_joined(kept: KeptResults):
+    joined = join_results([select_seeds(kept, 1, 2), select_seeds(kept, 0, 1)])
+    assert format_results(joined) == format_results(kept)
+    other = replace(kept.runs["2"][1], id="other")
+    twice = replace(kept, runs={"2": {1: other}})
+    with pytest.raises(InputError, match="'2' seed 1: has two runs"):
+        join_results([kept, twice])
+    with pytest.raises(InputError, match=f"must be '{kept.command}'"):
+        join_results([kept, replace(kept, overrides=("data=synthetic",))])
+
+
+def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, tmp_path: Path):
+    """Means are over all clips; a clip of two splits counts once, with its mean error."""
+    save_results(tmp_path / "kept.json", select_seeds(kept, 0, 1))
+    first = load_kept_results(tmp_path / "kept.json")
+    moved = {label: {} for label in ("2", "2, 4", "2, 4, 6, 8")}
+    for label, runs in moved.items():
+        for seed, run in first.runs[label].items():
+            clips = {
+                f"new/{name}" if i else name: errors for i, (name, errors) in enumerate(run.clips.items())
+            }
+            shared = next(iter(clips))
+            clips[shared] = {
+                "stream": {"combined": dict.fromkeys(clips[shared]["stream"]["combined"], 100.0)}
+            }
+            means = {"stream": {"combined": run.means["stream"]["combined"]}}
+            runs[seed] = replace(run, id=f"{run.id}b", clips=clips, means=means)
+    del moved["2"][0]
+    second = replace(first, overrides=(*first.overrides, "data.split.seed=7"), runs=moved)
+    save_results(tmp_path / "kept.json", join_results([first, second]))
+    pooled = load_kept_results(tmp_path / "kept.json")
+    assert (pooled.splits, pooled.run_count) == (("", "data.split.seed=7"), 10)
+    seeds = {label: [*runs] for label, runs in pooled.runs.items()}
+    assert seeds == {"2": [1], "2, 4": [0, 1], "2, 4, 6, 8": [0, 1]}
+    run, own = pooled.runs["2, 4"][0], first.runs["2, 4"][0]
+    values = list(own.get_clip_values([*own.clips], "stream", "combined", "MPJPE"))
+    expected = ((values[0] + 100) / 2 + 2 * sum(values[1:])) / (2 * len(values) - 1)
+    assert run.get_value("stream", "combined", "MPJPE") == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(InputError, match="pooled results cannot be joined"):
+        join_results([pooled, first])

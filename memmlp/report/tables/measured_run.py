@@ -377,7 +377,7 @@ def _join_prerequisite_origins(origin: Origin, run: Run) -> Origin:
     for one in prerequisite:
         digests[one["id"]] += [one["weights"][:8]] if one.get("weights") else []
     weights = {name: _join_unique(found) for name, found in digests.items() if found}
-    joined = _join_origins(origin, list(map(_read_origin, prerequisite)))
+    joined = join_origins(origin, list(map(_read_origin, prerequisite)))
     return replace(
         joined,
         prerequisite_versions=collect_prerequisite_versions(run.manifest),
@@ -389,10 +389,11 @@ def _add_evaluations(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Or
     others = [_read_origin({**report.get("made_by", {}), **report}) for report in reports]
     versions = {name: number for one in (origin, *others) for name, number in one.component_versions.items()}
     offline = any(report.get("offline") for report in reports)
-    return replace(_join_origins(origin, others), component_versions=versions, offline=offline)
+    return replace(join_origins(origin, others), component_versions=versions, offline=offline)
 
 
-def _join_origins(origin: Origin, others: Sequence[Origin]) -> Origin:
+def join_origins(origin: Origin, others: Sequence[Origin]) -> Origin:
+    """Return an origin with the code, machines, packages and plugins of others."""
     found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
