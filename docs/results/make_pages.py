@@ -71,7 +71,7 @@ def join_budgets(sources: Mapping[str, KeptTable]) -> dict[str, Table]:
     joined: dict[str, Table] = {}
     for name, source in sorted(sources.items()):
         others = [text for text in source.kept.overrides if not text.startswith("optim.tflop=")]
-        page = first.setdefault((source.kept.sweep, *others), name)
+        page = first.setdefault((source.kept.sweep, *others, *source.kept.splits), name)
         rows = joined[page].rows if page in joined else ()
         joined[page] = replace(source.table, rows=(*rows, *source.table.rows))
     return {name: table for name, table in joined.items() if list_costs(table)}

@@ -130,6 +130,17 @@ class Placeholders:
                 texts.append(f"'{row.label}' {number} ({price:.2g})")
         return escape_markdown(join_first(texts))
 
+    def lowest(self, name: str, *metrics: str, mode: str = "stream") -> str:
+        """Return the variant with the lowest error of a table, for each metric."""
+        texts = []
+        for metric in metrics:
+            cells = [(row.cells[mode][metric], row.label) for row in self._find_table(name).rows]
+            cell, label = min(
+                (one for one in cells if one[0].mean is not None), key=lambda one: one[0].mean or 0.0
+            )
+            texts.append(f"{metric} {format_mean(cell, metric)} {find_unit(metric)} ('{label}')")
+        return escape_markdown(", ".join(texts))
+
     def searches(self, trials: int, tflop: float) -> str:
         """Return a table of a search at equal compute, with the best of the first random trials and the trial
         of the network's own recipe. Networks that lack one of these are left out. Raises InputError if a

@@ -69,8 +69,10 @@ def _pool_splits(parts: Sequence[KeptResults]) -> KeptResults:
     runs: dict[str, RunsBySeed] = defaultdict(dict)
     for label, seed in by_split[0]:
         if all((label, seed) in found for found in by_split):
-            pooled = _pool_runs([found[label, seed] for found in by_split])
-            runs[label] = {**runs[label], seed: pooled}
+            trained = [found[label, seed] for found in by_split]
+            if len({run.id for run in trained}) < len(trained):
+                raise InputError(f"'{label}' seed {seed}: two splits have the same run; they must differ")
+            runs[label] = {**runs[label], seed: _pool_runs(trained)}
     splits = tuple(
         next((text for text in one.overrides if parse_key(text) == SPLIT_KEY), "") for one in parts
     )

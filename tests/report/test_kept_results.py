@@ -150,5 +150,7 @@ def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, tm
     values = list(own.get_clip_values([*own.clips], "stream", "combined", "MPJPE"))
     expected = ((values[0] + 100) / 2 + 2 * sum(values[1:])) / (2 * len(values) - 1)
     assert run.get_value("stream", "combined", "MPJPE") == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(InputError, match="two splits have the same run"):
+        join_results([first, replace(first, overrides=second.overrides)])
     with pytest.raises(InputError, match="pooled results cannot be joined"):
         join_results([pooled, first])

@@ -114,6 +114,7 @@ def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResult
     assert 1 < sum(better) < len(rows)
     assert [f"({cost:.2g})" in text for cost in costs] == better
     assert fill('{{ leaders(["t", "t"], "MPJPE", "ms") }}', made) == text
+    assert f"('{rows[np.argmin(errors)].label}')" in fill('{{ lowest("t", "MPJPE") }}', made)
 
 
 def test_a_mean_over_more_clips_than_the_controls_has_the_shared_clips_beside_it(sweep, kept):
