@@ -22,14 +22,14 @@ SPLIT_KEY = "data.split.seed"
 def join_results(parts: Sequence[KeptResults]) -> KeptResults:
     """Join kept results of one sweep.
 
-    Results with equal overrides are joined by variant and seed. Results that differ in `data.split.seed` are
-    pooled: a joined run is the trainings of a variant and seed with all splits, and its test clips are those
-    of all splits. A clip of several splits has its mean error. Variants and seeds that lack a split are left
-    out.
+    Results with equal overrides are joined by variant and seed, also those with equal pooled splits. Results
+    that differ in `data.split.seed` are pooled: a joined run is the trainings of a variant and seed with all
+    splits, and its test clips are those of all splits. A clip of several splits has its mean error. Variants
+    and seeds that lack a split are left out.
 
     Raises:
-        InputError: if the results have other sweeps, overrides or variants, seed rounds, or pooled splits; or
-            if a variant and seed has several runs.
+        InputError: if the results have other sweeps, overrides or variants, or seed rounds; if some of them,
+            but not all, are pooled; or if a variant and seed has several runs.
     """
     for one, other in pairwise(parts):
         if (one.sweep, _drop_split(one.overrides)) != (other.sweep, _drop_split(other.overrides)):
@@ -37,11 +37,13 @@ def join_results(parts: Sequence[KeptResults]) -> KeptResults:
         for label in one.variants.keys() & other.variants.keys():
             if one.variants[label] != other.variants[label]:
                 raise InputError(f"variant '{label}': its overrides differ between the results")
-    if any(one.rounds or one.splits for one in parts):
-        raise InputError("results of --until-decided and pooled results cannot be joined")
+    if any(one.rounds for one in parts):
+        raise InputError("results of --until-decided cannot be joined")
     by_split: dict[tuple[str, ...], list[KeptResults]] = defaultdict(list)
     for one in parts:
-        by_split[one.overrides].append(one)
+        by_split[(*one.overrides, *one.splits)].append(one)
+    if len(by_split) > 1 and any(one.splits for one in parts):
+        raise InputError("pooled results can only be joined with results that pool the same splits")
     joined = [_join_seeds(found) for found in by_split.values()]
     return joined[0] if len(joined) == 1 else _pool_splits(joined)
 

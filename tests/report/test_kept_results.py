@@ -152,5 +152,7 @@ def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, tm
     assert run.get_value("stream", "combined", "MPJPE") == pytest.approx(expected, rel=1e-5)
     with pytest.raises(InputError, match="two splits have the same run"):
         join_results([first, replace(first, overrides=second.overrides)])
-    with pytest.raises(InputError, match="pooled results cannot be joined"):
+    with pytest.raises(InputError, match="results that pool the same splits"):
         join_results([pooled, first])
+    parts = [select_seeds(replace(pooled, runs={"2, 4": pooled.runs["2, 4"]}), seed) for seed in (0, 1)]
+    assert join_results(parts).runs == {"2, 4": pooled.runs["2, 4"]}
