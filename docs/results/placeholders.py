@@ -11,7 +11,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.text_formats import escape_markdown
 from memmlp.report.tables.flags import join_first
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table import Table
+from memmlp.report.tables.table import Row, Table
 from memmlp.report.tables.table_text import (
     CONFOUNDED,
     MISSING,
@@ -89,7 +89,8 @@ class Placeholders:
             for row, metric, cell, effect in table.list_effects(mode):
                 small = abs(cell.paper_effect or 0) <= above_margin * table.smallest.get(metric, 0)
                 if effect.verdict == verdict and not small and bool(row.confounded) == confounded:
-                    found.setdefault(f"Table {table.number} '{row.label}'", []).append(metric)
+                    head = f"Table {table.number} " if table.number else ""
+                    found.setdefault(f"{head}'{row.label}'", []).append(metric)
         return escape_markdown("; ".join(f"{row}: {', '.join(metrics)}" for row, metrics in found.items()))
 
     def overview(self, *patterns: str) -> str:
@@ -116,9 +117,10 @@ class Placeholders:
         return make_markdown_table(heads, lines)
 
     def leaders(self, names: Sequence[str], metric: str, cost: str, mode: str = "stream") -> str:
-        """Return the variants of some tables that no other one beats in both a metric and a cost."""
+        """Return the variants of some tables that no other one beats in both a metric and a cost. Variants
+        with one seed do not count in a table where others have more."""
         known = []
-        for row in (row for name in names for row in self._find_table(name).rows):
+        for row in (row for name in names for row in _select_repeated(self._find_table(name))):
             price = find_cost(row, mode, cost)
             if price is not None and (mean := row.cells[mode][metric].mean) is not None:
                 known.append((price, mean, row))
@@ -131,10 +133,10 @@ class Placeholders:
         return escape_markdown(join_first(texts))
 
     def lowest(self, name: str, *metrics: str, mode: str = "stream") -> str:
-        """Return the variant with the lowest error of a table, for each metric."""
-        texts = []
+        """Return the variant with the lowest error of a table, for each metric; of those in `leaders`."""
+        texts, rows = [], _select_repeated(self._find_table(name))
         for metric in metrics:
-            cells = [(row.cells[mode][metric], row.label) for row in self._find_table(name).rows]
+            cells = [(row.cells[mode][metric], row.label) for row in rows]
             cell, label = min(
                 (one for one in cells if one[0].mean is not None), key=lambda one: one[0].mean or 0.0
             )
@@ -200,3 +202,8 @@ class Placeholders:
         if (name, patterns) not in self._regrouped:
             self._regrouped[name, patterns] = regroup(patterns)
         return self._regrouped[name, patterns]
+
+
+def _select_repeated(table: Table) -> list[Row]:
+    several = [row for row in table.rows if len(row.found) > 1]
+    return several or list(table.rows)
