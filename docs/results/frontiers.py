@@ -45,14 +45,15 @@ def list_costs(table: Table) -> list[str]:
     known = {cost: [row for row in table.rows if cost in row.costs] for cost in LABELS}
     if not table.measured_metrics or not known[COMPUTE]:
         return []
-    by_series = [
-        [row.costs[COMPUTE] for row in known[COMPUTE] if row.series == name]
-        for name in {row.series for row in known[COMPUTE]}
-    ]
-    budgets = any(max(found) > MIN_RATIO * min(found) for found in by_series)
+    budgets = any(_has_budgets(table, name) for name in {row.series for row in known[COMPUTE]})
     times = [row.costs[LATENCY] for row in known[LATENCY]]
     timed = len(times) > 2 and max(times) > MIN_RATIO * min(times) and (budgets or LATENCY in table.metrics)
     return [COMPUTE] * budgets + [LATENCY] * timed
+
+
+def _has_budgets(table: Table, series: str) -> bool:
+    found = [row.costs[COMPUTE] for row in table.rows if row.series == series and COMPUTE in row.costs]
+    return max(found) > MIN_RATIO * min(found)
 
 
 def choose_metric(table: Table) -> str:
@@ -61,9 +62,14 @@ def choose_metric(table: Table) -> str:
 
 
 def list_points(table: Table, cost: str) -> Iterator[Point]:
-    """Yield the places of the table's variants with a known cost, in its first mode, by series and cost."""
+    """Yield the places of the table's variants with a known cost, in its first mode, by series and cost.
+
+    Against compute, only networks with several budgets count.
+    """
     mode, metric = table.modes[0], choose_metric(table)
     known = [(row, price) for row in table.rows if (price := find_cost(row, mode, cost)) is not None]
+    if cost == COMPUTE:
+        known = [one for one in known if _has_budgets(table, one[0].series)]
     for row, price in sorted(known, key=lambda one: (one[0].series, one[1])):
         cell = row.cells[mode][metric]
         if cell.mean is not None:
@@ -90,31 +96,32 @@ def draw_frontiers(table: Table) -> bytes:
     points = {cost: list(list_points(table, cost)) for cost in list_costs(table)}
     names = sorted({point.series for found in points.values() for point in found})
     with rc_context({"svg.hashsalt": table.name, "font.size": 9}):
-        figure = Figure(figsize=(9, 3 + 0.08 * len(names)), layout="constrained")
+        figure = Figure(figsize=(9, 3.5 + 0.1 * len(names)), layout="constrained")
         first = None
         for number, (cost, found) in enumerate(points.items(), 1):
             first = axes = figure.add_subplot(1, len(points), number, sharey=first)
-            _draw_curves(axes, found, names, SHIFT if cost == COMPUTE else 1.0)
+            _draw_points(axes, found, names, cost == COMPUTE)
             axes.set_xscale("log", subs=[])
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.set(xlabel=LABELS[cost], ylabel=add_unit(choose_metric(table)))
             axes.grid(alpha=0.25)
-        handles, labels = figure.axes[0].get_legend_handles_labels()
+        handles, labels = figure.axes[-1].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
         picture = BytesIO()
         figure.savefig(picture, format="svg", metadata={"Date": None})
     return picture.getvalue()
 
 
-def _draw_curves(axes: Axes, points: Sequence[Point], names: Sequence[str], ratio: float) -> None:
-    """Draw a curve for each network; `ratio` is the distance between neighbouring networks at one cost."""
+def _draw_points(axes: Axes, points: Sequence[Point], names: Sequence[str], joined: bool) -> None:
+    """Draw the points of each network; joined points of several networks at one cost stand side by side."""
     for name, group in itertools.groupby(points, key=lambda point: point.series):
         own = list(group)
         sides = [[one.mean - one.low for one in own], [one.high - one.mean for one in own]]
         place = names.index(name)
-        colour, shift = f"C{place % 10}", ratio ** (place - len(names) / 2)
+        colour, shift = f"C{place % 10}", SHIFT ** (place - len(names) / 2) if joined else 1.0
         axes.errorbar(
             [shift * one.cost for one in own], [one.mean for one in own], sides, label=name, color=colour,
-            marker="os^"[place // 10 % 3], markersize=4, capsize=2, linewidth=1.4,
+            marker="os^"[place // 10 % 3], markersize=4, linestyle="-" if joined else "", linewidth=1.2,
+            elinewidth=0.6,
         )  # fmt: skip

@@ -50,6 +50,8 @@ def test_points_are_the_cells_of_a_network_by_budget(table: Table):
         assert (point.mean, point.low, point.high) == (cell.mean, cell.low, cell.high)
         assert point.low < point.mean < point.high
     assert rows["RPM, optim.tflop=5"].costs["seconds"] == 300
+    fewer = replace(table, rows=table.rows[:-1])  # one network with one budget
+    assert {point.series for point in list_points(fewer, "tflop")} < {point.series for point in points}
 
 
 def test_one_budget_needs_latencies_for_a_frontier(table: Table):
