@@ -107,7 +107,7 @@ def _describe_table(source: KeptTable) -> Iterator[str]:
         return
     yield f"Mode: {table.modes[0]}; {escape_markdown(describe_branches(table))}."
     if any(table.list_effects(table.modes[0])):
-        verdict = "its [verdict](pages.md#verdicts)"
+        verdict = "its [verdict](pages.md#verdicts), if it is not inconclusive"
         yield f"In parentheses: the difference from {_name_control(table)} and {verdict}."
         if table.comparisons:
             yield f"Verdicts are corrected for this page's {table.comparisons} comparisons."
@@ -201,7 +201,8 @@ def _describe_cell(cell: Cell, metric: str, control: Cell | None = None) -> str:
         return " ".join([mean, *ratio])
     if control and control.mean is not None and effect.clips == control.clips < cell.clips:
         mean = f"{mean}; shared clips: {control.mean + effect.mean:.2f}"
-    return f"{mean} ({' '.join(filter(None, [difference.strip('*'), effect.verdict]))})"
+    verdict = effect.verdict if effect.verdict != Verdict.INCONCLUSIVE else None
+    return f"{mean} ({' '.join(filter(None, [difference.strip('*'), verdict]))})"
 
 
 def _make_series_table(source: KeptTable) -> str:
