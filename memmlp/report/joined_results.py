@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from memmlp.report.tables.measured_run import Errors, MeasuredRun, join_origins
 from memmlp.sweep.definition import parse_key
 
 SPLIT_KEY = "data.split.seed"
+WARNINGS = ("partial", "divided", "resampled", "unusual")  # texts of an origin
 
 
 def join_results(parts: Sequence[KeptResults]) -> KeptResults:
@@ -25,17 +26,19 @@ def join_results(parts: Sequence[KeptResults]) -> KeptResults:
     Results with equal overrides are joined by variant and seed, also those with equal pooled splits. Results
     that differ in `data.split.seed` are pooled: a joined run is the trainings of a variant and seed with all
     splits, and its test clips are those of all splits. A clip of several splits has its mean error. Variants
-    and seeds that lack a split are left out.
+    and seeds that lack a split are left out, with a flag.
 
     Raises:
         InputError: if the results have other sweeps, overrides or variants, or seed rounds; if some of them,
-            but not all, are pooled; or if a variant and seed has several runs.
+            but not all, are pooled; if a variant and seed has several runs; or if the runs of several splits
+            have the same test clips, other groups or other component versions.
     """
-    for one, other in pairwise(parts):
-        if (one.sweep, _drop_split(one.overrides)) != (other.sweep, _drop_split(other.overrides)):
-            raise InputError(f"'{other.command}': must be '{one.command}', or differ only in {SPLIT_KEY}")
-        for label in one.variants.keys() & other.variants.keys():
-            if one.variants[label] != other.variants[label]:
+    variants: dict[str, tuple[str, ...]] = {}
+    for one in parts:
+        if (one.sweep, _drop_split(one.overrides)) != (parts[0].sweep, _drop_split(parts[0].overrides)):
+            raise InputError(f"'{one.command}': must be '{parts[0].command}', or differ only in {SPLIT_KEY}")
+        for label, overrides in one.variants.items():
+            if variants.setdefault(label, overrides) != overrides:
                 raise InputError(f"variant '{label}': its overrides differ between the results")
     if any(one.rounds for one in parts):
         raise InputError("results of --until-decided cannot be joined")
@@ -72,9 +75,15 @@ def _pool_splits(parts: Sequence[KeptResults]) -> KeptResults:
     for label, seed in by_split[0]:
         if all((label, seed) in found for found in by_split):
             trained = [found[label, seed] for found in by_split]
-            if len({run.id for run in trained}) < len(trained):
-                raise InputError(f"'{label}' seed {seed}: two splits have the same run; they must differ")
-            runs[label] = {**runs[label], seed: _pool_runs(trained)}
+            try:
+                runs[label] = {**runs[label], seed: _pool_runs(trained)}
+            except InputError as error:
+                raise InputError(f"'{label}' seed {seed}: {error}") from None
+    if not runs:
+        raise InputError(f"{SPLIT_KEY}: no variant and seed has runs of all splits")
+    keys = {key for found in by_split for key in found if not all(key in other for other in by_split)}
+    lacking = [f"'{label}' seed {seed}" for label, seed in sorted(keys)]
+    left_out = (f"left out, because runs of a split are missing: {', '.join(lacking)}",) if lacking else ()
     splits = tuple(
         next((text for text in one.overrides if parse_key(text) == SPLIT_KEY), "") for one in parts
     )
@@ -83,13 +92,26 @@ def _pool_splits(parts: Sequence[KeptResults]) -> KeptResults:
         overrides=_drop_split(parts[0].overrides),
         runs=runs,
         variants={label: parts[0].variants[label] for label in runs},
-        flags=tuple(dict.fromkeys(flag for one in parts for flag in one.flags)),
+        flags=(*dict.fromkeys(flag for one in parts for flag in one.flags), *left_out),
         splits=splits,
     )
 
 
 def _pool_runs(runs: Sequence[MeasuredRun]) -> MeasuredRun:
     """Return the trainings of a variant and seed with several splits as one run, with the first's costs."""
+    origins = [run.origin for run in runs]
+    groups = {clip: group for run in runs for clip, group in run.groups.items()}
+    if len({tuple(sorted(run.clips)) for run in runs}) < len(runs):
+        raise InputError("two splits have the same test clips; their persons must differ")
+    if any(groups[clip] != group for run in runs for clip, group in run.groups.items()):
+        raise InputError("the groups of test clips must be the same in all splits")
+    versions = {item for origin in origins for item in origin.component_versions.items()}
+    if len(versions) > len(dict(versions)) or len({(one.precision, one.body) for one in origins}) > 1:
+        raise InputError("component versions, precision and body must be the same in all splits")
+    warnings: dict[str, Any] = {
+        key: "; ".join(dict.fromkeys(filter(None, map(attrgetter(key), origins)))) or None for key in WARNINGS
+    }
+    data = ", ".join(dict.fromkeys(origin.data for origin in origins))
     by_clip: dict[str, list[Errors]] = defaultdict(list)
     for run in runs:
         for clip, errors in run.clips.items():
@@ -100,9 +122,9 @@ def _pool_runs(runs: Sequence[MeasuredRun]) -> MeasuredRun:
         id="+".join(run.id for run in runs),
         clips=clips,
         means=next(iter(clips.values())),  # restrict_to_clips computes their values
-        groups={clip: group for run in runs for clip, group in run.groups.items()},
+        groups=groups,
         clip_sources={clip: source for run in runs for clip, source in run.clip_sources.items()},
-        origin=join_origins(runs[0].origin, [run.origin for run in runs[1:]]),
+        origin=replace(join_origins(origins[0], origins[1:]), data=data, **warnings),
         run=None,
     )
     return pooled.restrict_to_clips(list(clips))

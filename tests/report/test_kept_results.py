@@ -150,8 +150,14 @@ def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, tm
     values = list(own.get_clip_values([*own.clips], "stream", "combined", "MPJPE"))
     expected = ((values[0] + 100) / 2 + 2 * sum(values[1:])) / (2 * len(values) - 1)
     assert run.get_value("stream", "combined", "MPJPE") == pytest.approx(expected, rel=1e-5)
-    with pytest.raises(InputError, match="two splits have the same run"):
+    assert pooled.flags == (
+        "left out, because runs of a split are missing: '2' seed 0, '2, 4, 6' seed 0, '2, 4, 6' seed 1",
+    )
+    with pytest.raises(InputError, match="two splits have the same test clips"):
         join_results([first, replace(first, overrides=second.overrides)])
+    old = {"2, 4": {0: replace(run, origin=replace(run.origin, precision="bf16"))}}
+    with pytest.raises(InputError, match="'2, 4' seed 0: component versions, precision"):
+        join_results([first, replace(second, runs=old)])
     with pytest.raises(InputError, match="results that pool the same splits"):
         join_results([pooled, first])
     parts = [select_seeds(replace(pooled, runs={"2, 4": pooled.runs["2, 4"]}), seed) for seed in (0, 1)]
