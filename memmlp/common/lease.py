@@ -176,12 +176,12 @@ class Lock:
         if lease is None:
             yield None
             return
-        _leases[key] = lease
-        try:
-            with lease.keep_alive():
+        with lease.keep_alive():
+            _leases[key] = lease
+            try:
                 yield lease
-        finally:
-            del _leases[key]
+            finally:  # before the release: another thread of this process may claim the folder after it
+                del _leases[key]
 
     @property
     def owner(self) -> dict[str, Any] | None:

@@ -9,6 +9,7 @@ import os
 import random
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -181,6 +182,34 @@ def test_a_folder_beside_its_lock(tmp_path: Path, clock: Clock):
         one(publish, left, place)
     two(publish, two(begin), place)
     assert (place / "half").exists()
+
+
+def test_a_thread_may_lock_the_folder_as_soon_as_another_one_has_released_it(tmp_path, monkeypatch):
+    keep_alive, held, end, written = Lease.keep_alive, threading.Event(), threading.Event(), []
+
+    def follow() -> None:
+        with taken(Lock(tmp_path)) as mine:
+            held.set()
+            assert end.wait(10)
+            written.append((mine.number, temporary_path(tmp_path / "result").name))
+
+    thread = threading.Thread(target=follow)
+
+    @contextlib.contextmanager
+    def let_the_other_follow(self: Lease) -> Iterator[None]:
+        with keep_alive(self):
+            yield
+        if threading.current_thread() is not thread:
+            thread.start()
+            assert held.wait(10)
+
+    monkeypatch.setattr(Lease, "keep_alive", let_the_other_follow)
+    with taken(Lock(tmp_path)):
+        pass
+    end.set()
+    thread.join()
+    [(number, name)] = written
+    assert f".lease-{number}." in name
 
 
 @pytest.mark.parametrize("seed", range(5))
