@@ -162,7 +162,7 @@ def make_kept_table(kept: KeptResults, source: str | None = None, patterns: Sequ
         sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
         sweep, runs, restricted = restrict_and_group_clips(sweep, kept.select_runs(sweep), source, patterns)
         flags = [*restricted, *([other] if other else [])]
-        table = make_table(sweep, runs, command=kept.command)
+        table = make_table(sweep, runs, command=kept.command_for_all_splits)
     changed = sorted({change for run in kept.all_runs for change in list_outdated(run.origin.every_version)})
     if changed:
         flags.append(f"made with earlier component versions: {', '.join(changed)}")

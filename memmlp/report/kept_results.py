@@ -59,6 +59,12 @@ class KeptResults:
         return join_command(["memmlp", "sweep", self.sweep, *self.overrides])
 
     @property
+    def command_for_all_splits(self) -> str:
+        """The command, and what to add to it for the runs of each other split."""
+        others = [split for split in self.splits if split]
+        return f"{self.command}, and again with {', '.join(others)}" if others else self.command
+
+    @property
     def all_runs(self) -> list[MeasuredRun]:
         """The runs sorted by name; a run appears once for each of its evaluations and deployments."""
         return [run for _, run in sorted(self.runs_by_name.items())]

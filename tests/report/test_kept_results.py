@@ -144,6 +144,7 @@ def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, tm
     save_results(tmp_path / "kept.json", join_results([first, second]))
     pooled = load_kept_results(tmp_path / "kept.json")
     assert (pooled.splits, pooled.run_count) == (("", "data.split.seed=7"), 10)
+    assert pooled.command_for_all_splits == f"{first.command}, and again with data.split.seed=7"
     seeds = {label: [*runs] for label, runs in pooled.runs.items()}
     assert seeds == {"2": [1], "2, 4": [0, 1], "2, 4, 6, 8": [0, 1]}
     run, own = pooled.runs["2, 4"][0], first.runs["2, 4"][0]
