@@ -197,8 +197,7 @@ def compose_search(overrides: Sequence[str]) -> None:
 
 
 BOTH_SOURCES = (
-    "mix", "scaling", "networks", "recurrent_poser", "recurrent_poser_ingredients", "smooth_motion",
-    "data=cmu_bandai",
+    "mix", "scaling", "networks", "recurrent_poser", "recurrent_poser_ingredients", "data=cmu_bandai",
 )  # fmt: skip
 """Sweeps and configs with data of both importers."""
 

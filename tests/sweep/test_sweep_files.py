@@ -60,7 +60,7 @@ def test_tables_carry_their_number_and_the_printed_values():
             assert [label for label, _ in variants] == labels
 
 
-OF_NETWORKS = {"networks", "paper_size", "recurrent_poser", "smooth_motion", "table01", "table02", "table03"}
+OF_NETWORKS = {"networks", "paper_size", "recurrent_poser", "table01", "table02", "table03"}
 """Sweeps whose labels name whole networks, with their losses and features."""
 OF_SEVERAL = {
     "no Multi-Head, no Memory-Block, Mem-MLP's loss": 2, "+ Mem-MLP's backbone": 4,
