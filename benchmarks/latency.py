@@ -114,7 +114,7 @@ def time_poses_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> 
 @click.option(
     "--models",
     default=DEFAULT_MODELS,
-    help="Options of `model` to time, separated by commas; NAME@FRAMES sets model.frames.",
+    help="Options of `model`, separated by commas. NAME@FRAMES sets model.frames, NAME+KEY=VALUE any key.",
 )
 @click.option("--json", "file", type=PATH, help="JSON file to write the rows into.")
 @click.argument("overrides", nargs=-1)
@@ -154,9 +154,10 @@ def export_all(
 
     clips = [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
     for name in progress_bar(models, "exporting"):
-        option, _, frames = name.partition("@")
+        named, *own = name.split("+")
+        option, _, frames = named.partition("@")
         size = (f"model.frames={frames}",) if frames else ()
-        model = build_untrained(("profile=paper", *overrides, f"model={option}", *size))
+        model = build_untrained(("profile=paper", *overrides, f"model={option}", *size, *own))
         files = {graph: folder / f"{name}.{graph}.onnx" for graph in GRAPHS}
         export(strip_conversions(model), files["network"], "random")
         export(model, files["naive"], "random")
@@ -204,8 +205,8 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
     print("x: the time divided by AvatarPoser's time, for the network or for the whole pose")
     print("core: minimum % of a round in which the thread had a core; below 90, the times are unreliable")
     table = Table(box=None, pad_edge=False)
-    for name in ("network", "graph"):
-        table.add_column(name, no_wrap=True)
+    table.add_column("network", overflow="fold", min_width=16)
+    table.add_column("graph", no_wrap=True)
     for name in ("step", "p95", "x", "rounds", "pose", "x", "core"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:

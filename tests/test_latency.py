@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.latency import GRAPHS, RoundTimes, latency, summarize, time_in_rounds
+from benchmarks.latency import GRAPHS, RoundTimes, export_all, latency, summarize, time_in_rounds
 from memmlp.common import processes
 from memmlp.common.errors import InputError
 
@@ -36,6 +36,14 @@ def test_every_graph_is_timed_and_compared(tmp_path, capsys: pytest.CaptureFixtu
     assert rows["naive"]["pose_ratio_to_avatar_poser"] == 1
     assert [graph for graph, row in rows.items() if "pose_median_ms" in row] == list(GRAPHS[1:])
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
+
+
+@pytest.mark.long
+def test_a_network_may_have_keys_of_its_own(tmp_path):
+    names = ["recurrent_poser", "recurrent_poser+model.members=1+model.width=8"]
+    paths = dict(export_all(names, ("profile=tiny",), tmp_path))
+    large, small = (paths[name, "streaming"].stat().st_size for name in names)
+    assert small < 0.8 * large
 
 
 @pytest.mark.parametrize("words", [["--models", "mem_mlp@41"], ["model=rpm"], ["model.frames=9"]])
