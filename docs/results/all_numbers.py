@@ -12,8 +12,8 @@ from memmlp.sweep.definition import COSTS
 CSV_HEADINGS = (
     "test clips", "variant", "mode", "branch", "metric", "unit", "seeds", "planned seeds", "clips", "mean",
     "sd", "low", "high", "compared with", "its branch", "difference", "difference low", "difference high",
-    "p", "corrected p", "equivalence p", "verdict", "decided at seeds", "detectable", "paper",
-    "paper difference", "confounded",
+    "p", "corrected p", "bootstrap p", "equivalence p", "verdict", "decided at seeds", "detectable",
+    "groups", "groups above", "paper", "paper difference", "confounded",
 )  # fmt: skip
 
 
@@ -59,9 +59,10 @@ def _make_csv_line(
     other: str,
     cell: Cell | None = None,
 ) -> list[object]:
-    names = ("mean", "low", "high", "p", "holm", "equal", "verdict", "decided", "detectable")
+    names = ("mean", "low", "high", "p", "holm", "bootstrap", "equal", "verdict", "decided", "detectable")
     line = [row.label, *head, find_unit(head[-1]), *numbers, *((row.against, other) if effect else ("", ""))]
     line += [getattr(effect, name) if effect else "" for name in names]
+    line += [effect.groups, effect.groups_above] if effect and effect.groups else ["", ""]
     line += [cell.paper, cell.paper_effect] if cell else ["", ""]
     return [_shorten(one) for one in (*line, row.confounded)]
 

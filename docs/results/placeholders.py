@@ -143,6 +143,18 @@ class Placeholders:
             texts.append(f"{metric} {format_mean(cell, metric)} {find_unit(metric)} ('{label}')")
         return escape_markdown(", ".join(texts))
 
+    def agreement(self, name: str, metric: str, mode: str = "stream") -> str:
+        """Return, for each variant with several seeds, in how many groups of clips its error is higher than
+        its control's."""
+        table = self._find_table(name)
+        repeated = [row.label for row in _select_repeated(table)]
+        found = [
+            f"'{row.label}' {effect.groups_above} of {effect.groups}"
+            for row, one, _, effect in table.list_effects(mode)
+            if one == metric and row.label in repeated
+        ]
+        return escape_markdown(join_first(found))
+
     def searches(self, trials: int, tflop: float) -> str:
         """Return a table of a search at equal compute, with the best of the first random trials and the trial
         of the network's own recipe. Networks that lack one of these are left out. Raises InputError if a

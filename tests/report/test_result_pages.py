@@ -115,6 +115,11 @@ def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResult
     assert [f"({cost:.2g})" in text for cost in costs] == better
     assert fill('{{ leaders(["t", "t"], "MPJPE", "ms") }}', made) == text
     assert f"('{rows[np.argmin(errors)].label}')" in fill('{{ lowest("t", "MPJPE") }}', made)
+    label, effect = next(
+        (row.label, e) for row, metric, _, e in made.table.list_effects("stream") if metric == "MPJPE"
+    )
+    text = fill('{{ agreement("t", "MPJPE") }}', made)
+    assert f"'{label}' {effect.groups_above} of {effect.groups}" in text.replace("\\", "")
 
 
 def test_a_mean_over_more_clips_than_the_controls_has_the_shared_clips_beside_it(sweep, kept):

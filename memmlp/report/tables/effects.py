@@ -12,6 +12,7 @@ import numpy as np
 
 from memmlp.report.tables.measured_run import SHARED_METRIC, MeasuredRun, select_runs_for_metric
 from memmlp.report.tables.statistics import (
+    average_groups,
     compute_bootstrap_p,
     compute_detectable,
     compute_equivalence_p,
@@ -230,13 +231,14 @@ def estimate_effects(
         seen = compute_detectable(differences, comparisons, groups) if sensitivity else nothing
         second = compute_bootstrap_p(differences, groups) if sensitivity else nothing
         numbers = estimate_paired_effects(differences, groups)
-        columns = zip(keys, *numbers[:4], second, same, seen, strict=True)
-        for key, mean, low, high, p, other, equal, least in columns:
+        above = (average_groups(differences, groups)[0].mean(1) > 0).sum(1)
+        columns = zip(keys, *numbers[:4], second, same, seen, above, strict=True)
+        for key, mean, low, high, p, other, equal, least, count in columns:
             values = {"low": low, "high": high}
             tested = {"p": p, "bootstrap": other, "equal": equal, "detectable": least}
             values |= tested if pairs[key].is_testable else {}
             known: dict[str, Any] = {name: convert_nan_to_none(number) for name, number in values.items()}
-            found[key] = Effect(float(mean), **known, **size)
+            found[key] = Effect(float(mean), groups_above=int(count), **known, **size)
     return {key: found[key] for key in pairs}
 
 

@@ -37,6 +37,7 @@ class Effect:
         verdict: the verdict.
         detectable: the smallest difference that this comparison detects with 80 % power.
         seeds, clips, groups: the numbers of paired seeds, clips and clip groups.
+        groups_above: the number of groups in which the variant's mean over seeds is higher.
         level: the significance level for corrected p-values.
         decided: the number of seeds at the interim analysis that decided the verdict; None without one.
         within_noise: whether the ratio of two times is at most MAX_TIME_RATIO.
@@ -54,6 +55,7 @@ class Effect:
     seeds: int = 0
     clips: int = 0
     groups: int = 0
+    groups_above: int | None = None
     level: float = LEVEL
     decided: int | None = None
     within_noise: bool = False

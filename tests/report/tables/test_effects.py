@@ -52,6 +52,21 @@ def test_a_mean_has_the_interval_of_its_errors(sweep: Sweep, tmp_path: Path):
     assert cell(make_table(sweep, one), "full_model", "MPJPE").low is not None  # over clips alone
 
 
+def test_groups_with_a_higher_error_are_counted(sweep: Sweep, tmp_path: Path):
+    groups = {clip: clip[-1:] for clip in CLIPS}
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep, {}, groups=groups))
+    effect = cell(make_table(sweep, runs), "no | memory", "MPJPE").effect
+    sums = {group: [0.0, 0.0] for group in groups.values()}
+    for side, label in enumerate(("no | memory", "full_model")):
+        for run in runs[label].values():
+            values = run.get_clip_values(CLIPS, "stream", "rotation", "MPJPE")
+            for clip, value in zip(CLIPS, values, strict=True):
+                sums[groups[clip]][side] += value
+    above = sum(ours > theirs for ours, theirs in sums.values())
+    assert 0 < above < len(sums)
+    assert (effect.groups_above, effect.groups) == (above, len(sums))
+
+
 def test_other_branches_have_the_effects_of_their_own_table(sweep: Sweep, tmp_path: Path):
     """Variant and control are in one branch, even if the row compares two branches."""
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS))
