@@ -35,7 +35,7 @@ class Placeholders:
 
     def __init__(self, sources: Mapping[str, KeptTable], trials: Sequence[Trial]):
         self.sources, self._trials = sources, trials
-        self._regrouped: dict[tuple[str, tuple[str, ...]], Table] = {}
+        self._regrouped: dict[tuple[str, tuple[str, ...], bool], Table] = {}
 
     def collect_functions(self) -> dict[str, object]:
         """Return the functions by name, and the list `names` of all results."""
@@ -72,6 +72,7 @@ class Placeholders:
         confounded: bool = False,
         joined: str = "",
         above_margin: bool = False,
+        weigh_groups: bool = False,
     ) -> str:
         """Return the effects with a verdict such as `holds`, in the branch that the paper prints.
 
@@ -82,12 +83,13 @@ class Placeholders:
             confounded: whether to list only confounded rows, instead of all other rows.
             joined: a regular expression; clips with equal matches are one group.
             above_margin: whether the paper's own effect must exceed the smallest effect of interest.
+            weigh_groups: whether each group of clips has the same weight.
         """
         found: dict[str, list[str]] = {}
         for name in names:
-            table = self._find_table(name, joined)
+            table = self._find_table(name, joined, weigh_groups)
             for row, metric, cell, effect in table.list_effects(mode):
-                small = abs(cell.paper_effect or 0) <= above_margin * table.smallest.get(metric, 0)
+                small = above_margin and abs(cell.paper_effect or 0) <= table.smallest.get(metric, 0)
                 if effect.verdict == verdict and not small and bool(row.confounded) == confounded:
                     head = f"Table {table.number} " if table.number else ""
                     found.setdefault(f"{head}'{row.label}'", []).append(metric)
@@ -200,20 +202,23 @@ class Placeholders:
         sound, apart = (f"{found[True]} of {found.total()}" for found in counts)
         return f"{sound}; {CONFOUNDED} {apart}" if counts[1] else sound
 
-    def _find_table(self, name: str, joined: str = "") -> Table:
+    def _find_table(self, name: str, joined: str = "", weigh_groups: bool = False) -> Table:
         if name not in self.sources:
             choices = ", ".join(sorted(self.sources)) or "none"
             raise InputError(f"'{name}': results must be one of {choices}")
-        return self._regroup(name, (joined,)) if joined else self.sources[name].table
+        patterns = (joined,) if joined else ()
+        other = patterns or weigh_groups
+        return self._regroup(name, patterns, weigh_groups) if other else self.sources[name].table
 
-    def _regroup(self, name: str, patterns: tuple[str, ...]) -> Table:
-        """Return a table with coarser clip groups, which takes seconds to compute, at most once."""
+    def _regroup(self, name: str, patterns: tuple[str, ...], weigh_groups: bool = False) -> Table:
+        """Return a table with other clip groups, which takes seconds to compute, at most once."""
         regroup = self.sources[name].regroup
         if regroup is None:
             return self.sources[name].table
-        if (name, patterns) not in self._regrouped:
-            self._regrouped[name, patterns] = regroup(patterns)
-        return self._regrouped[name, patterns]
+        key = name, patterns, weigh_groups
+        if key not in self._regrouped:
+            self._regrouped[key] = regroup(patterns, weigh_groups)
+        return self._regrouped[key]
 
 
 def _select_repeated(table: Table) -> list[Row]:

@@ -46,13 +46,14 @@ class KeptTable(NamedTuple):
         kept: the results.
         table: the table computed from the results.
         by_source: one table for each source of test clips, if there are several sources.
-        regroup: makes the table with coarser clip groups, from patterns (`build_table.group_clips`).
+        regroup: makes the table with other clip groups, from patterns and whether each group has the same
+            weight (`build_table.restrict_and_group_clips`).
     """
 
     kept: KeptResults
     table: Table
     by_source: tuple[Table, ...] = ()
-    regroup: Callable[[Sequence[str]], Table] | None = None
+    regroup: Callable[[Sequence[str], bool], Table] | None = None
 
     @property
     def by_clips(self) -> dict[str, Table]:

@@ -112,6 +112,12 @@ together_option = click.option(
     "repeatable.",
 )
 
+weigh_groups_option = click.option(
+    "--weigh-groups",
+    is_flag=True,
+    help="Give each group of test clips, such as a person, the same weight instead of each clip.",
+)
+
 
 def add_page_options(port: int) -> Callable[[Command], Command]:
     """Add the options --port, with the default `port`, and --no-browser to a command that serves a page."""

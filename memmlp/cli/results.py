@@ -17,6 +17,7 @@ from memmlp.cli.options import (
     plugins_option,
     source_option,
     together_option,
+    weigh_groups_option,
 )
 from memmlp.common.errors import InputError
 
@@ -124,18 +125,24 @@ def _load_named(folder: Path, name: str) -> KeptResults:
 @click.argument("name", metavar="NAME")
 @source_option
 @together_option
+@weigh_groups_option
 @click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Its data/ has the results.")
-def show(name: str, source: str | None, together: tuple[str, ...], folder: Path) -> None:
+def show(name: str, source: str | None, together: tuple[str, ...], weigh_groups: bool, folder: Path) -> None:
     """Print the table of kept results. NAME is the name of their file; no run is needed."""
     from memmlp.cli.table import print_tables
 
-    print_tables([make_kept_table(_load_named(folder, name), source, together)])
+    print_tables([make_kept_table(_load_named(folder, name), source, together, weigh_groups)])
 
 
-def make_kept_table(kept: KeptResults, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
+def make_kept_table(
+    kept: KeptResults,
+    source: str | None = None,
+    patterns: Sequence[str] = (),
+    weigh_groups: bool = False,
+) -> Table:
     """Compute the table of kept results for the sweep's seeds and all additional seeds with runs. With
     `source`, only its test clips count. Test clips form one group if a pattern matches the same text in their
-    names."""
+    names. With `weigh_groups`, each group has the same weight."""
     from memmlp.cli.table import flag_changed_rounds
     from memmlp.config.compose_plan import find_sweep
     from memmlp.report.tables.build_table import make_table, restrict_and_group_clips
@@ -150,8 +157,9 @@ def make_kept_table(kept: KeptResults, source: str | None = None, patterns: Sequ
     rounds = Rounds.from_json(kept.rounds) if kept.rounds else None
     other = flag_changed_rounds(rounds, sweep) if rounds else None
     if rounds and not other:
-        if source or patterns:
-            raise InputError("--source, --together: need a fixed number of seeds, without --until-decided")
+        if source or patterns or weigh_groups:
+            options = "--source, --together, --weigh-groups"
+            raise InputError(f"{options}: need a fixed number of seeds, without --until-decided")
         spent = rounds.restrict_sweep(sweep)
         table = make_table(
             spent, kept.select_runs(spent), command=f"{kept.command} --until-decided", rounds=rounds
@@ -160,7 +168,9 @@ def make_kept_table(kept: KeptResults, source: str | None = None, patterns: Sequ
         # Seeds without a kept run count as missing, because a table with one of five seeds is not finished.
         seeds = sorted({*sweep.seeds, *(seed for by_seed in kept.runs.values() for seed in by_seed)})
         sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
-        sweep, runs, restricted = restrict_and_group_clips(sweep, kept.select_runs(sweep), source, patterns)
+        sweep, runs, restricted = restrict_and_group_clips(
+            sweep, kept.select_runs(sweep), source, patterns, weigh_groups
+        )
         flags = [*restricted, *([other] if other else [])]
         table = make_table(sweep, runs, command=kept.command_for_all_splits)
     changed = sorted({change for run in kept.all_runs for change in list_outdated(run.origin.every_version)})

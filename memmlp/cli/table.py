@@ -18,6 +18,7 @@ from memmlp.cli.options import (
     plugins_option,
     source_option,
     together_option,
+    weigh_groups_option,
 )
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
@@ -58,6 +59,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 )
 @source_option
 @together_option
+@weigh_groups_option
 @click.option(
     "--untrained",
     is_flag=True,
@@ -85,6 +87,7 @@ def table(
     branch: str | None,
     source: str | None,
     together: tuple[str, ...],
+    weigh_groups: bool,
     untrained: bool,
     seeds_needed: bool,
     official: bool,
@@ -97,7 +100,7 @@ def table(
     """
     from memmlp.report.tables.measured_run import load_measured_run
 
-    selection = TableSelection(branch, source, together, untrained)
+    selection = TableSelection(branch, source, together, weigh_groups, untrained)
     gc.disable()  # garbage collection takes a second and finds nothing here
     try:
         results = gather_tables(
@@ -160,11 +163,13 @@ def print_official_values(tables: Sequence[SweepTable], outputs: Path, modes: Se
 class TableSelection(NamedTuple):
     """A selection of a sweep's results for its table. `branch`: None for each variant's default; `source`:
     show only its test clips; `together`: patterns of test clips that count as one group, in addition to the
-    groups of the data; `untrained`: measure the costs of networks without a run, with random weights."""
+    groups of the data; `weigh_groups`: give each group the same weight; `untrained`: measure the costs of
+    networks without a run, with random weights."""
 
     branch: str | None = None
     source: str | None = None
     together: Sequence[str] = ()
+    weigh_groups: bool = False
     untrained: bool = False
 
 
@@ -232,16 +237,23 @@ def make_plan_table(
     )
 
     sweep, plan, rounds, flags = shown
-    for option, given in (("source", selection.source), ("together", " ".join(selection.together))):
+    options = {
+        f"--source {selection.source}": selection.source,
+        f"--together {' '.join(selection.together)}": selection.together,
+        "--weigh-groups": selection.weigh_groups,
+    }
+    for option, given in options.items():
         if given and rounds:
-            raise InputError(f"--{option} {given}: cannot be combined with --until-decided")
+            raise InputError(f"{option}: cannot be combined with --until-decided")
     runs = find_finished_runs(sweep, make_run_finder(plan, read))
     if selection.untrained:
         from memmlp.config.untrained_costs import measure_untrained_variants
 
         runs, measured = measure_untrained_variants(sweep, runs)
         flags = (*flags, *measured)
-    sweep, runs, restricted = restrict_and_group_clips(sweep, runs, selection.source, selection.together)
+    sweep, runs, restricted = restrict_and_group_clips(
+        sweep, runs, selection.source, selection.together, selection.weigh_groups
+    )
     flags = (*restricted, *flags)
     command = f"{command} --until-decided" if rounds else command
     table = make_table(sweep, runs, modes, command, make_state_finder(plan), rounds)

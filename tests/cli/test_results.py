@@ -44,6 +44,9 @@ def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
     ran = memmlp("results", "show", "table14", "--together", "(salsa)")
     assert ran.code == 0
     assert "merged 4 groups of test clips into 3" in " ".join(ran.out.split())
+    for words in (["results", "show", "table14"], ["table", "14"]):
+        flagged = " ".join(memmlp(*words, "--weigh-groups").out.split())
+        assert "each group of test clips has the same weight" in flagged
     kept = memmlp("results", "show", "table14").out
     assert "merged" not in kept
     assert kept.splitlines()[2:20] == memmlp("table", "14").out.splitlines()[2:20]

@@ -87,7 +87,7 @@ def test_effects_are_listed_and_counted_with_joined_clips_too(sweep: Sweep, kept
     """The coarser table has other verdicts; `above_margin` leaves out the paper's small effects."""
     made = source(sweep, kept)
     coarser = make_table(sweep, group_clips(kept.select_runs(sweep), ["(.)"])[0])
-    made = made._replace(regroup=lambda patterns: coarser if patterns == ("(.)",) else made.table)
+    made = made._replace(regroup=lambda patterns, weigh: coarser if patterns == ("(.)",) else made.table)
     text = fill('{{ claims(["t"], "(.)") }}\n\n{{ decisions(["t"], "holds", joined="(.)") }}|', made)
     counts = format_counts(coarser.count_verdicts("stream"))
     assert f"| all, contents joined | {counts} |" in text
@@ -97,6 +97,18 @@ def test_effects_are_listed_and_counted_with_joined_clips_too(sweep: Sweep, kept
     wide = made._replace(table=replace(made.table, smallest=small))
     assert fill('{{ decisions(["t"], "holds", above_margin=true) }}|', wide).splitlines()[-1] == "|"
     assert "Table 14 '2'" in fill('{{ decisions(["t"], "holds", above_margin=true) }}', made)
+
+
+def test_significant_effects_without_a_sign_in_the_paper_are_listed(sweep: Sweep, kept: KeptResults):
+    bare = replace(sweep, table=None, variants=tuple(replace(one, paper=None) for one in sweep.variants))
+    made = source(bare, kept)
+    effects = [(row.label, metric, e.verdict) for row, metric, _, e in made.table.list_effects("stream")]
+    verdicts = [Verdict.HIGHER, Verdict.LOWER]
+    found = [fill(f'{{{{ decisions(["t"], "{verdict}") }}}}', made).splitlines()[-1] for verdict in verdicts]
+    assert any(verdict in verdicts for *_, verdict in effects)
+    for verdict, text in zip(verdicts, found, strict=True):
+        metrics = [metric for _, metric, one in effects if one == verdict]
+        assert sum(text.count(metric) for metric in set(metrics)) == len(metrics)
 
 
 def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResults):
@@ -137,8 +149,8 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
     """Counted again from Holm's p-values; the coarser table is the one that the source makes."""
     made = source(sweep, kept)
 
-    def coarser(patterns: Sequence[str]):
-        assert patterns == ("a", "b")
+    def coarser(patterns: Sequence[str], weigh_groups: bool):
+        assert (patterns, weigh_groups) == (("a", "b"), False)
         return make_table(sweep, group_clips(kept.select_runs(sweep), ["(.)"])[0])
 
     made = made._replace(regroup=coarser)

@@ -335,13 +335,24 @@ def restrict_to_source(
 
 
 def restrict_and_group_clips(
-    sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str | None, patterns: Sequence[str]
+    sweep: Sweep,
+    runs: Mapping[str, RunsBySeed],
+    source: str | None,
+    patterns: Sequence[str],
+    weigh_groups: bool = False,
 ) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
-    """Restrict a sweep and its runs to a source, if given, and group clips by patterns, if given."""
+    """Restrict a sweep and its runs to a source, if given, and group clips by patterns, if given. With
+    `weigh_groups`, each group of clips has the same weight."""
     flags: tuple[str, ...] = ()
     if source:
         sweep, runs, flags = restrict_to_source(sweep, runs, source)
     grouped, group_flags = group_clips(runs, patterns)
+    if weigh_groups:
+        averaged: dict[str, RunsBySeed] = {
+            label: {seed: run.average_groups() for seed, run in seeds.items()}
+            for label, seeds in grouped.items()
+        }
+        return sweep, averaged, (*flags, *group_flags, "each group of test clips has the same weight")
     return sweep, grouped, (*flags, *group_flags)
 
 

@@ -174,6 +174,15 @@ class MeasuredRun:
         groups = grouping.group_clips({clip: clip for clip in self.clips})
         return replace(self, groups={clip: group[0] for group in groups for clip in group})
 
+    def average_groups(self) -> MeasuredRun:
+        """Return the results with the means of each group of clips as one clip."""
+        members: dict[str, list[str]] = {}
+        for clip in self.clips:
+            members.setdefault(self.get_group(clip), []).append(clip)
+        means = {group: self.restrict_to_clips(clips).means for group, clips in sorted(members.items())}
+        averaged = replace(self, clips=means, groups={}, clip_sources={})
+        return averaged.restrict_to_clips(list(means))
+
     def split_by_source(self) -> dict[str, MeasuredRun]:
         """Return the results by source, each restricted to the source's clips; empty for a single source."""
         own: dict[str, list[str]] = {name: [] for name in sorted(set(self.clip_sources.values()))}

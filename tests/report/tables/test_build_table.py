@@ -1,15 +1,22 @@
 """From a sweep and its runs to a table."""
 
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fake_runs import CLIPS, fake_sweep, runs_of
 from processes import finished
 
 from memmlp.common.errors import InputError
-from memmlp.report.tables.build_table import group_clips, make_table, restrict_to_source
+from memmlp.report.tables.build_table import (
+    group_clips,
+    make_table,
+    restrict_and_group_clips,
+    restrict_to_source,
+)
 from memmlp.sweep.sweep_file import parse_sweep
 
 
@@ -47,6 +54,38 @@ def test_variants_without_a_sources_clips_are_left_out_and_named(tmp_path: Path)
     assert all(len(run.clips) == len(CLIPS) // 2 for run in old_runs["both"].values())
     with pytest.raises(InputError, match=r"--source third: no finished run .* must be new or old"):
         restrict_to_source(sweep, runs, "third")
+
+
+def test_groups_of_equal_weight_are_like_clips(tmp_path: Path):
+    """A table by hand: the means of each group's clips are the errors of one clip."""
+    sweep = parse_sweep("two", {"variants": {"one": [], "other": ["optim.lr=1"]}, "seeds": [0, 1, 2]})
+    groups = {clip: clip.split("/")[0] if "kicks" in clip else clip[-1] for clip in CLIPS}
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep, {"other": 1.1}, groups=groups))
+    _, averaged, flags = restrict_and_group_clips(sweep, runs, None, (), weigh_groups=True)
+    assert flags == ("each group of test clips has the same weight",)
+    names = sorted(set(groups.values()))
+    for label, seeds in runs.items():
+        for seed, run in seeds.items():
+            values = dict(zip(CLIPS, run.get_clip_values(CLIPS, "stream", "rotation", "MPJPE"), strict=True))
+            means = [np.mean([values[clip] for clip in CLIPS if groups[clip] == name]) for name in names]
+            found = averaged[label][seed]
+            assert list(found.get_clip_values(names, "stream", "rotation", "MPJPE")) == pytest.approx(means)
+            assert found.get_value("stream", "rotation", "MPJPE") == pytest.approx(np.mean(means))
+    effects = [make_table(sweep, one).rows[1].cells["stream"]["MPJPE"].effect for one in (runs, averaged)]
+    assert [(one.clips, one.groups) for one in effects] == [
+        (len(CLIPS), len(names)),
+        (len(names), len(names)),
+    ]
+
+
+def test_a_group_with_a_clip_on_which_a_network_diverged_has_no_mean(tmp_path: Path):
+    sweep = parse_sweep("one", {"variants": {"one": []}, "seeds": [0]})
+    groups = {clip: clip.split("/")[0] for clip in CLIPS}
+    run = runs_of(sweep, fake_sweep(tmp_path, sweep, {}, groups=groups))["one"][0]
+    errors = {metric: math.nan for metric in run.clips["kicks/01"]["stream"]["rotation"]}
+    lost = replace(run, clips={**run.clips, "kicks/01": {"stream": {"rotation": errors}}}).average_groups()
+    values = lost.get_clip_values(["kicks", "salsa"], "stream", "rotation", "MPJPE")
+    assert list(np.isnan(values)) == [True, False]
 
 
 def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(tmp_path: Path):
