@@ -42,11 +42,12 @@ def list_costs(table: Table) -> list[str]:
     Latency alone makes a frontier if it is a column and the training compute is known. At least three
     variants must have a known latency, and it must differ.
     """
-    known = {cost: [row for row in table.rows if cost in row.costs] for cost in LABELS}
-    if not table.measured_metrics or not known[COMPUTE]:
+    known = [row for row in table.rows if COMPUTE in row.costs]
+    if not table.measured_metrics or not known:
         return []
-    budgets = any(_has_budgets(table, name) for name in {row.series for row in known[COMPUTE]})
-    times = [row.costs[LATENCY] for row in known[LATENCY]]
+    budgets = any(_has_budgets(table, name) for name in {row.series for row in known})
+    prices = (find_cost(row, table.modes[0], LATENCY) for row in table.rows)
+    times = [price for price in prices if price is not None]
     timed = len(times) > 2 and max(times) > MIN_RATIO * min(times) and (budgets or LATENCY in table.metrics)
     return [COMPUTE] * budgets + [LATENCY] * timed
 

@@ -14,7 +14,7 @@ from docs.results.make_pages import draw_pictures, make_pages
 from docs.results.table_page import KeptTable
 from memmlp.common.text_formats import parse_csv
 from memmlp.report.kept_results import KeptResults
-from memmlp.report.tables.table import Table
+from memmlp.report.tables.table import Cell, Table
 from memmlp.sweep.sweep_file import parse_sweep
 
 CONTENT = {
@@ -66,6 +66,13 @@ def test_one_budget_needs_latencies_for_a_frontier(table: Table):
     assert list_costs(with_costs(ratio=0.1)) == ["ratio"]
     assert list_costs(with_costs(parameters=1)) == list_costs(with_costs()) == []
     assert list_costs(replace(with_costs(ratio=0.1), metrics=("MPJPE",))) == []
+    timed = with_costs(parameters=1)  # some seeds were not timed, so the cells have times, and the costs none
+    cells = [
+        row.cells | {"stream": {**row.cells["stream"], "ratio": Cell({0: 0.1 * 2**i})}}
+        for i, row in enumerate(timed.rows)
+    ]
+    rows = [replace(row, cells=one) for row, one in zip(timed.rows, cells, strict=True)]
+    assert list_costs(replace(timed, rows=tuple(rows))) == ["ratio"]
 
 
 def test_the_page_has_a_picture_and_its_file_the_costs(table: Table):
