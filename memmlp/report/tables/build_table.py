@@ -342,12 +342,19 @@ def restrict_and_group_clips(
     weigh_groups: bool = False,
 ) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
     """Restrict a sweep and its runs to a source, if given, and group clips by patterns, if given. With
-    `weigh_groups`, each group of clips has the same weight."""
+    `weigh_groups`, each group of clips has the same weight.
+
+    Raises:
+        InputError: if no run has test clips of the source; if a pattern is not valid; or with `weigh_groups`,
+            if runs have different test clips, so that a group's means would be of different clips.
+    """
     flags: tuple[str, ...] = ()
     if source:
         sweep, runs, flags = restrict_to_source(sweep, runs, source)
     grouped, group_flags = group_clips(runs, patterns)
     if weigh_groups:
+        if len({frozenset(run.clips) for seeds in grouped.values() for run in seeds.values()}) > 1:
+            raise InputError("--weigh-groups: all runs must have the same test clips; --source may help")
         averaged: dict[str, RunsBySeed] = {
             label: {seed: run.average_groups() for seed, run in seeds.items()}
             for label, seeds in grouped.items()

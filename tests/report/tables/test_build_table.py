@@ -78,6 +78,14 @@ def test_groups_of_equal_weight_are_like_clips(tmp_path: Path):
     ]
 
 
+def test_groups_of_equal_weight_need_the_same_clips_in_all_runs(tmp_path: Path):
+    sweep = parse_sweep("two", {"variants": {"one": [], "other": ["optim.lr=1"]}, "seeds": [0]})
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep, {}))
+    fewer = runs | {"other": {0: runs["other"][0].restrict_to_clips(CLIPS[1:])}}
+    with pytest.raises(InputError, match=r"^--weigh-groups: all runs must have the same test clips"):
+        restrict_and_group_clips(sweep, fewer, None, (), weigh_groups=True)
+
+
 def test_a_group_with_a_clip_on_which_a_network_diverged_has_no_mean(tmp_path: Path):
     sweep = parse_sweep("one", {"variants": {"one": []}, "seeds": [0]})
     groups = {clip: clip.split("/")[0] for clip in CLIPS}
