@@ -48,7 +48,7 @@ from memmlp.runs.run import Run
 from memmlp.training.run_stages import deploy_run, describe_machine, evaluate_run
 
 MODELS = Path(__file__).parent
-DATA = "outputs/data/persons"  # the folder of the import in docs/guides/motion.md
+DATA = "outputs/data/persons"  # the folder of the import in docs/guides/checks.md
 KEPT = (
     "id", "kind", "name", "data", "body", "prerequisite", "started", "finished", "seconds", "steps", "tflop",
     "best_step", "component_versions", "version", "git", "packages", "cpu", "device", "threads", "precision",
