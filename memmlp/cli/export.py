@@ -181,11 +181,11 @@ def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
     line about the difference. Raises ClickException if they differ by more than rounding errors; then nothing
     is written."""
     from memmlp.common.progress import announce
-    from memmlp.deploy.parity import TOLERANCE, are_rounding_errors, measure_differences, select_parity_clips
+    from memmlp.deploy.parity import TOLERANCE, are_rounding_errors, measure_differences, select_parity_clip
     from memmlp.live.trackers_to_body_graph import measure_full_graph_differences
 
     model, network = load(opened, form)
-    (clip,) = select_parity_clips(model, opened.data.open("test").read_clips())
+    clip = select_parity_clip(model, opened.data.open("test").read_clips())
     announce(f"export: write {out}, and compare it with torch on a test clip")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"

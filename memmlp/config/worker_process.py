@@ -5,7 +5,7 @@ from pathlib import Path
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.sweep.worker import Cancelled, Presence, has_controller, work_on_plan
+from memmlp.sweep.worker import Cancelled, has_controller, is_writer_alive, work_on_plan
 from memmlp.training.request import RunRequest
 
 

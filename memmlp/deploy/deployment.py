@@ -17,7 +17,7 @@ from memmlp.deploy.parity import (
     are_rounding_errors,
     count_frames_until_past_is_full,
     measure_differences,
-    select_parity_clips,
+    select_parity_clip,
 )
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
@@ -35,16 +35,9 @@ otherwise."""
 
 @dataclass(frozen=True)
 class Deployment:
-    """The settings of a deployment.
-
-    Attributes:
-        latency_steps: number of steps to time, after a warm-up.
-        graph: "auto", "streaming" or "naive" (see GRAPHS).
-        precision: "fp32", "int8" or "fp16". A float32 file is always written; other precisions
-            add a second file.
-        opset: ONNX opset of the files, one of memmlp.deploy.opsets.OPSETS.
-        alone: whether to time the network also without conversions and forward kinematics.
-    """
+    """The settings of a deployment: the number of steps to time, after a warm-up; the graph (a key of
+    GRAPHS); the precision ("fp32", "int8" or "fp16"; others than fp32 add a second file); the ONNX opset (one
+    of OPSETS); and whether to time the network also without conversions and forward kinematics."""
 
     latency_steps: int
     graph: str = "auto"
@@ -60,27 +53,16 @@ class Deployment:
         train: Sequence[Tensor],
         test: Sequence[Tensor],
     ) -> dict[str, Any]:
-        """Write a run's ONNX files, and compare the float32 file with torch on the longest test clip.
-
-        Args:
-            model: the trained network.
-            deployed: the folder for the files.
-            run_id: the run's id for the metadata.
-            train: training clips (N, 252); they calibrate int8.
-            test: test clips (N, 252) for the parity check and the accuracy of lower precisions.
-
-        Returns:
-            Sizes and times of the files, and the accuracy of the file with lower precision.
-
-        Raises:
-            RuntimeError: if the results of ONNX Runtime and torch differ by more than rounding errors.
-        """
+        """Write a run's ONNX files, and compare the float32 file with torch on the longest test clip. Return
+        sizes and times of the files, and the accuracy of the file with lower precision. `train` clips (N,
+        252) calibrate int8; `test` clips (N, 252) serve for the comparison and the accuracy. Raises
+        RuntimeError if ONNX Runtime and torch differ by more than rounding errors."""
         from memmlp.deploy.export import export  # slow to import, and few processes export
 
         deployed.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
         export(network, deployed.onnx, run_id, self.opset)
-        (clip,) = select_parity_clips(model, test)
+        clip = select_parity_clip(model, test)
         if len(clip) < count_frames_until_past_is_full(model):
             announce(
                 f"export: the longest test clip has only {len(clip)} frames; "
@@ -93,9 +75,9 @@ class Deployment:
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e}; "
                 f"must be at most {TOLERANCE:.0e}, or rounding errors"
             )
-        record: dict[str, Any] = dict(self.measure_times(model, deployed.onnx))
-        record |= latency.measure_size(model, network, deployed.onnx)
-        record |= {
+        record: dict[str, Any] = {
+            **self.measure_times(model, deployed.onnx),
+            **latency.measure_size(model, network, deployed.onnx),
             "graph": "streaming" if isinstance(network, StreamingGraph) else "naive",
             "onnx_parity": worst,
             "parity_frames": len(clip),

@@ -54,11 +54,8 @@ class OneStep(nn.Module):
 
 
 def export(model: MotionModel | StreamingGraph, path: Path, run_id: str, opset: int = NATIVE) -> None:
-    """Write the model's streaming step and its metadata as an ONNX file for the CPU in float32.
-
-    Raises:
-        InputError: if the step can't be converted to the opset.
-    """
+    """Write the model's streaming step and its metadata as an ONNX file for the CPU in float32. Raises
+    InputError if the step can't be converted to the opset."""
     step = OneStep(model.cpu().eval())
     names = [f"state.{name}" for name in step.names]
     export_module(
@@ -81,20 +78,8 @@ def export_module(
     meta: dict[str, str],
     opset: int = NATIVE,
 ) -> None:
-    """Write a module as one ONNX file, atomically.
-
-    Args:
-        step: the module to export.
-        arguments: example arguments for the `forward` method.
-        inputs: names of the arguments in the file.
-        outputs: names of the outputs in the file.
-        path: the file to write.
-        meta: the file's metadata.
-        opset: one of memmlp.deploy.opsets.OPSETS.
-
-    Raises:
-        InputError: if the step can't be converted to the opset.
-    """
+    """Write a module as one ONNX file, atomically. `arguments` are examples for its `forward` method; they
+    and the outputs get the given names. Raises InputError if the step can't be converted to the opset."""
     with silence_exporter(), disable_sampling(step):
         program = torch.onnx.export(
             step,
@@ -139,11 +124,9 @@ def silence_exporter() -> Iterator[None]:
 
 
 def simplify(model: onnx_ir.Model) -> None:
-    """Fold constants, and remove unused and duplicate nodes and the exporter's notes.
-
-    The exporter's own optimiser also tries rewriting rules. They rarely apply to these graphs, and take up to
-    half of the export time. The notes contain local paths and source code, which can be more than half of a
-    small file.
+    """Fold constants, and remove unused and duplicate nodes and the exporter's notes. The exporter's own
+    optimiser also tries rewriting rules, which rarely apply to these graphs, and take up to half of the
+    export time. The notes contain local paths and source code, which can be more than half of a small file.
     """
     common.InlinePass()(model)
     for node in model.graph:
@@ -153,23 +136,19 @@ def simplify(model: onnx_ir.Model) -> None:
         if weight and weight.is_initializer() and str(weight.name).endswith("weight"):
             node.outputs[0].name = f"{weight.name}.{node.outputs[0].name}"
     fold_constants(model, onnx_shape_inference=True)
-    SIMPLER(model)
+    onnx_ir.passes.Sequential(
+        common.RemoveUnusedNodesPass(),
+        common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        common.DeduplicateInitializersPass(),
+        common.CommonSubexpressionEliminationPass(),
+        common.OutputFixPass(),
+        common.NameFixPass(),
+    )(model)
     graph = model.graph
     graph.metadata_props.clear()
     outputs = (value for node in graph for value in node.outputs)
     for noted in (*graph, *outputs, *graph.inputs, *graph.outputs, *graph.initializers.values()):
         noted.metadata_props.clear()
-
-
-SIMPLER = onnx_ir.passes.Sequential(
-    common.RemoveUnusedNodesPass(),
-    common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
-    common.DeduplicateInitializersPass(),
-    common.CommonSubexpressionEliminationPass(),
-    common.OutputFixPass(),
-    common.NameFixPass(),
-)
-"""The passes that simplify a graph after constant folding."""
 
 
 def make_metadata(model: MotionModel | StreamingGraph, run_id: str) -> dict[str, str]:

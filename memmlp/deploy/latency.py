@@ -24,16 +24,14 @@ from memmlp.networks.vqvae import EMACodebook
 
 WARM_UP = 30  # number of untimed steps at the start
 Model = TypeVar("Model", bound=MotionModel)
-YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
+YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers
 
 
 def measure_step_times(path: Path, steps: int = 200) -> dict[str, Any]:
-    """Time one step of an exported file on one thread: median and 95th percentile, in milliseconds.
-
-    Steps alternate with the yardstick, a fixed computation. The ratio of both times allows comparisons
-    between machines. At least 200 steps are timed. `core_share` is the fraction of the time in which the
-    thread ran on a core. If it is far below 1, the times include waiting for other processes.
-    """
+    """Time one step of an exported file on one thread: median and 95th percentile, in milliseconds, of at
+    least 200 steps. Steps alternate with the yardstick, a fixed computation; the ratio of both times allows
+    comparisons between machines. `core_share` is the fraction of the time in which the thread ran on a core.
+    If it is far below 1, the times include waiting for other processes."""
     stream, reference = OnnxStream(path), start_session(make_yardstick().SerializeToString())
     sparse = np.zeros((1, SPARSE_DIM), np.float32)
     rows = {"input": np.ones(YARDSTICK_SHAPE[:2], np.float32)}
@@ -59,30 +57,23 @@ def measure_step_times(path: Path, steps: int = 200) -> dict[str, Any]:
 
 
 def measure_size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> dict[str, Any]:
-    """Return the number of parameters, MACs and FLOPs of a network, and the size of its file.
+    """Return the number of parameters, MACs and FLOPs of a network, and the size of its file. `step` is the
+    network or streaming graph that was exported.
 
     - "parameters": the parameters that training changes.
     - "parameters_with_vqvae": all parameters, including frozen parameters and code-vectors.
-    - "macs", "flops": the operations of the network, as papers report them.
+    - "macs", "flops": the operations of the network, as papers report them. Only matrix products are counted.
+      A FLOP is one multiplication or addition; a MAC is one multiplication and one addition.
     - "step_macs": the operations of the exported graph.
-    - "onnx_bytes": the size of the file.
-
-    Only matrix products are counted. A FLOP is one multiplication or addition. A MAC is one multiplication
-    and one addition.
-
-    Args:
-        model: the network as it was trained.
-        step: the network or streaming graph that was exported.
-        path: the exported file.
     """
-    multiplied = count_macs(model.cpu().eval())
+    macs = count_macs(model.cpu().eval())
     books = [part for part in model.modules() if isinstance(part, EMACodebook)]
     running_means = sum(book.vectors.numel() for book in books)  # learned, but not by gradients
     return {
         "parameters": model.count_parameters(),
         "parameters_with_vqvae": sum(p.numel() for p in model.parameters()) + running_means,
-        "macs": multiplied,
-        "flops": 2 * multiplied,
+        "macs": macs,
+        "flops": 2 * macs,
         "step_macs": count_macs(step.cpu().eval()),
         "onnx_bytes": path.stat().st_size,
     }
@@ -94,9 +85,7 @@ def count_macs(model: MotionModel | StreamingGraph) -> int:
     counter = FlopCounterMode(display=False)
     counter.flop_registry = {**flop_registry, **CPU_FORMULAS}
     fast = mha.get_fastpath_enabled()
-    mha.set_fastpath_enabled(
-        False
-    )  # the fast path runs whole layers as one kernel, which hides their products
+    mha.set_fastpath_enabled(False)  # it runs whole layers as one kernel, which hides their products
     try:
         with counter:
             model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
@@ -108,10 +97,8 @@ def count_macs(model: MotionModel | StreamingGraph) -> int:
 def _count_lstm_flops(
     x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest
 ) -> int:
-    """Count the FLOPs of an LSTM.
-
-    The arguments are shapes: inputs (n, B, inputs), input weights (4 k, inputs), hidden weights (4 k, k).
-    """
+    """Count the FLOPs of an LSTM, given the shapes of inputs (n, B, inputs), input weights (4 k, inputs) and
+    hidden weights (4 k, k)."""
     return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
 
 
@@ -125,7 +112,7 @@ CPU_FORMULAS = {
 
 
 def make_yardstick() -> onnx.ModelProto:
-    """Make the yardstick: a fixed reference network of matrix products and ReLUs."""
+    """Make the yardstick: a fixed reference network of matrix products and ReLUs, in 86 M multiply-adds."""
     rows, width, layers = YARDSTICK_SHAPE
     weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
     nodes, name = [], "input"
@@ -145,7 +132,6 @@ def make_yardstick() -> onnx.ModelProto:
 
 
 def _summarize_times(prefix: str, seconds: list[float]) -> dict[str, float]:
-    """Return the median and the 95th percentile in milliseconds; their keys begin with `prefix`."""
     return {
         f"{prefix}median_ms": 1000 * float(np.median(seconds)),
         f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
@@ -153,10 +139,8 @@ def _summarize_times(prefix: str, seconds: list[float]) -> dict[str, float]:
 
 
 class NoConversion(Normalizer):
-    """A normalizer that converts nothing. Inputs and outputs stay in network space.
-
-    Joint positions are zeros.
-    """
+    """A normalizer that converts nothing: inputs and outputs stay in network space. Joint positions are
+    zeros."""
 
     def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
         return sparse
@@ -181,11 +165,9 @@ class NoConversion(Normalizer):
 
 
 def strip_conversions(model: Model) -> Model:
-    """Copy a network, and remove its input and output conversions and its forward kinematics.
-
-    Papers time a network in this way: from its features to its outputs. Joint computations between layers
-    (AvatarJLM's tokens, MANIKIN's limbs) stay. The copy is only valid for timing.
-    """
+    """Copy a network, and remove its input and output conversions and its forward kinematics. Papers time a
+    network in this way: from its features to its outputs. Joint computations between layers (AvatarJLM's
+    tokens, MANIKIN's limbs) stay. The copy is only valid for timing."""
     stripped = copy.deepcopy(model)
     for module in list(stripped.modules()):
         for name, child in module.named_children():

@@ -42,18 +42,9 @@ LARGEST = float(np.finfo(np.float16).max)
 def write_lower_precision(
     precision: str, source: Path, path: Path, network: StreamingGraph, train: Sequence[Tensor]
 ) -> None:
-    """Write an ONNX file with lower precision.
-
-    Args:
-        precision: "int8" or "fp16".
-        source: the float32 ONNX file of a streaming graph.
-        path: the file to write.
-        network: the graph; its `float32_modules` stay in float32.
-        train: training clips (N, 252); they calibrate int8.
-
-    Raises:
-        InputError: if the graph does not have inner layers, or a weight is out of range for fp16.
-    """
+    """Write an ONNX file with lower precision, "int8" or "fp16", from the float32 file of a streaming graph.
+    Its `float32_modules` stay in float32. Training clips (N, 252) calibrate int8. Raises InputError if the
+    graph does not have inner layers, or a weight is out of range for fp16."""
     model = onnx.load(source)
     inner = find_inner_layers(model, network.float32_modules)
     if precision == "int8":
@@ -63,11 +54,8 @@ def write_lower_precision(
 
 
 def find_inner_layers(model: ModelProto, kept: Sequence[str]) -> list[str]:
-    """Return the names of the nodes that multiply by a layer's weight, outside of the kept modules.
-
-    Raises:
-        InputError: if there are no such nodes. ONNX Runtime would quantise all nodes for an empty list.
-    """
+    """Return the names of the nodes that multiply by a layer's weight, outside of the kept modules. Raises
+    InputError if there are none: ONNX Runtime would quantise all nodes for an empty list."""
     weights = {tensor.name for tensor in model.graph.initializer}
     inner = [
         node.name
@@ -87,39 +75,35 @@ def _list_prefixes(modules: Sequence[str]) -> tuple[str, ...]:
 
 
 class ActivationSamples(CalibrationDataReader):
-    """Calibration samples: the inputs and states at every twentieth frame of streamed clips (N, 252).
-
-    At most 40 clips are streamed, and the middle 400 frames of each clip.
-    """
+    """Calibration samples: the inputs and states at every twentieth frame of streamed clips (N, 252). At most
+    40 clips are streamed, and the middle 400 frames of each clip."""
 
     def __init__(self, path: Path, clips: Sequence[Tensor]):
-        self.samples = self._stream(OnnxStream(path), clips[:CALIBRATION_CLIPS])
+        self.samples = _stream_samples(OnnxStream(path), clips[:CALIBRATION_CLIPS])
 
     def get_next(self) -> dict[str, np.ndarray] | None:  # type: ignore[override]
         """Return the next sample, or None at the end."""
         return next(self.samples, None)  # type: ignore[arg-type]
 
-    @staticmethod
-    def _stream(stream: OnnxStream, clips: Sequence[Tensor]) -> Iterator[dict[str, np.ndarray]]:
-        for clip in clips:
-            stream.reset()
-            start = max(len(clip) - CALIBRATION_FRAMES, 0) // 2
-            middle = clip[start : start + CALIBRATION_FRAMES, None, :SPARSE_DIM]
-            for index, sparse in enumerate(middle.numpy()):
-                if index % CALIBRATION_EVERY == CALIBRATION_EVERY - 1:
-                    yield {"sparse": sparse, **stream.state}
-                stream.step(sparse)
+
+def _stream_samples(stream: OnnxStream, clips: Sequence[Tensor]) -> Iterator[dict[str, np.ndarray]]:
+    for clip in clips:
+        stream.reset()
+        start = max(len(clip) - CALIBRATION_FRAMES, 0) // 2
+        middle = clip[start : start + CALIBRATION_FRAMES, None, :SPARSE_DIM]
+        for index, sparse in enumerate(middle.numpy(), start=1):
+            if index % CALIBRATION_EVERY == 0:
+                yield {"sparse": sparse, **stream.state}
+            stream.step(sparse)
 
 
 def _quantise_to_int8(
     source: Path, path: Path, inner: list[str], corrected: tuple[str, ...], clips: Sequence[Tensor]
 ) -> None:
-    """Write an int8 file by ONNX Runtime's static quantisation. `corrected` are prefixes of weights.
-
-    Weights have seven bits and one scale per output, or one scale if they join several layers (ONNX Runtime
-    has no such product with more scales). CPUs without VNNI add products in sixteen bits, and would overflow
-    with eight-bit weights. Activations have eight bits and one scale, calibrated on streamed clips.
-    """
+    """Write an int8 file by ONNX Runtime's static quantisation. `corrected` are prefixes of weights. Weights
+    have seven bits and one scale per output, or one scale if they join several layers (ONNX Runtime has no
+    such product with more scales). CPUs without VNNI add products in sixteen bits, and would overflow with
+    eight-bit weights. Activations have eight bits and one scale, calibrated on streamed clips."""
     joined = [tensor.name for tensor in onnx.load(source).graph.initializer if len(tensor.dims) == 3]
     unfinished, root = temporary_path(path), logging.getLogger()
     level = root.level
@@ -168,19 +152,15 @@ def _check_quantised(model: ModelProto, inner: Collection[str]) -> None:
 
 def _correct_newest_frames(model: ModelProto, inner: Collection[str], corrected: tuple[str, ...]) -> None:
     """Add to each corrected layer the product of its weight and the rounding error of its input's last row.
-
     The error is at most half a step of eight bits. It has eight more bits, so the row has sixteen. Opset 15
-    cannot add to a row, so its files are not corrected.
-    """
+    cannot add to a row, so its files are not corrected."""
     if model.opset_import[0].version < 16:
         return
     constants, nodes = GraphConstants(model.graph), list[NodeProto]()
     makers = {name: node for node in model.graph.node for name in node.output}
     last = [constants.add(f"last_row.{value}", np.array([value])) for value in (-1, LAST, 0)]
-    row, middle = (
-        constants.add("last_row", np.array([[-1]])),
-        constants.add("middle", np.array(128, np.uint8)),
-    )
+    row = constants.add("last_row", np.array([[-1]]))
+    middle = constants.add("middle", np.array(128, np.uint8))
     for node in model.graph.node:
         nodes.append(node)
         if node.name not in inner or not node.input[1].startswith(corrected):
@@ -206,11 +186,9 @@ def _correct_newest_frames(model: ModelProto, inner: Collection[str], corrected:
 
 def convert_to_fp16(model: ModelProto, inner: Sequence[str]) -> ModelProto:
     """Return the graph with the weights and products of the inner layers in fp16. This halves the file size.
-
     The inputs and outputs of these products are fp16, like under autocast. Sums, normalisations, inputs,
     outputs and states stay float32, because fp16 resolves a world position of 4 m only to 4 mm. ONNX
-    Runtime's own converter would also round these values.
-    """
+    Runtime's own converter would also round these values."""
     constants, nodes, halves = GraphConstants(model.graph), list[NodeProto](), dict[str, str]()
     for node in model.graph.node:
         if node.name not in inner:
@@ -242,12 +220,10 @@ def _make_cast_node(name: str, output: str, kind: int) -> NodeProto:
 
 
 def measure_accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
-    """Stream clips (N, 252) in ONNX Runtime, and return the mean metrics of the rotation branch.
-
-    "position MPJPE" is the MPJPE of the file's output `position`. If the clips have more than 20,000 frames,
-    the same fraction of each clip is streamed, from its start, but enough for every metric. Clips that are
-    too short for a metric do not count (`average_clips`).
-    """
+    """Stream clips (N, 252) in ONNX Runtime, and return the mean metrics of the rotation branch. "position
+    MPJPE" is the MPJPE of the file's output `position`. If the clips have more than 20,000 frames, the same
+    fraction of each clip is streamed, from its start, but enough for every metric. Clips that are too short
+    for a metric do not count (`average_clips`)."""
     stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
     rows, frames = [], []
     for clip in progress_bar(clips, "measuring"):
@@ -264,26 +240,17 @@ def measure_accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]
 def compare_accuracy(
     exact: Path, other: Path, precision: str, normalizer: Normalizer, clips: Sequence[Tensor]
 ) -> dict[str, Any]:
-    """Measure the loss of accuracy from lower precision on test clips.
+    """Measure the loss of accuracy from lower precision on test clips (N, 252). `exact` is the float32 file,
+    `other` that of the same network in the given precision, such as "int8".
 
-    Args:
-        exact: the float32 file.
-        other: the file of the same network in lower precision.
-        precision: the name of the lower precision, such as "int8".
-        normalizer: the network's normalizer.
-        clips: test clips (N, 252).
-
-    Returns:
-        "fp32" and the precision's name: the metrics of both files.
-        "growth": the relative growth of MPJPE, for the branch with the larger growth.
-        "jitter_growth": the relative growth of Jitter.
-        "default": whether the file in lower precision may be the default (`is_accurate_enough`).
+    - "fp32" and the precision's name: the metrics of both files.
+    - "growth": the relative growth of MPJPE, for the branch with the larger growth.
+    - "jitter_growth": the relative growth of Jitter.
+    - "default": whether the file in lower precision may be the default (`is_accurate_enough`).
     """
     before, after = (measure_accuracy(path, normalizer, clips) for path in (exact, other))
-    growths = {name: after[name] / before[name] - 1 for name in ("MPJPE", "position MPJPE", "Jitter")}
-    jitter = growths.pop("Jitter")
-    grown = {
-        "growth": float(np.max(list(growths.values()))),
-        "jitter_growth": jitter,
-    }  # NaN if one growth is NaN
+    rotation, position, jitter = (
+        after[name] / before[name] - 1 for name in ("MPJPE", "position MPJPE", "Jitter")
+    )
+    grown = {"growth": float(np.maximum(rotation, position)), "jitter_growth": jitter}  # NaN if either is
     return {"fp32": before, precision: after, **grown, "default": is_accurate_enough(grown)}

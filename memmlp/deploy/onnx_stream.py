@@ -15,19 +15,9 @@ class OnnxStream:
     """An ONNX file that runs step by step. The outputs `state.*.next` become the next inputs `state.*`.
 
     There are two sets of state arrays. A step reads the old state from one set and writes the new state to
-    the other set. Then the sets are swapped. So a step does not allocate or copy arrays.
-
-    Args:
-        path: the ONNX file.
-
-    Attributes:
-        inputs: the arrays of the remaining inputs by name. Write them before a step.
-        outputs: the arrays of the remaining outputs by name. The next step overwrites them.
-
-    Raises:
-        InputError: if the file is missing or does not run, or its inputs and outputs are not valid for an
-            exported step.
-    """
+    the other set. Then the sets are swapped. So a step does not allocate or copy arrays. `inputs` and
+    `outputs` are the other arrays by name: write the inputs before a step; the next step overwrites the
+    outputs. Raises InputError if the file is missing, does not run, or is not an exported step."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -77,44 +67,25 @@ class OnnxStream:
         self._binding, self._other_binding = self._other_binding, self._binding
 
     def step(self, *given: np.ndarray) -> list[np.ndarray]:
-        """Run a step and return copies of the outputs in the file's order.
-
-        Args:
-            given: the input values in the file's order. A file of scope `step` takes sparse (1, 54)
-                and returns rotation6d (1, 22, 6) and position (1, 22, 3).
-        """
+        """Run a step, and return copies of the outputs. Inputs and outputs are in the file's order: a file of
+        scope `step` takes sparse (1, 54) and returns rotation6d (1, 22, 6) and position (1, 22, 3)."""
         for array, value in zip(self.inputs.values(), given, strict=True):
             array[:] = value
         self.advance()
         return [array.copy() for array in self.outputs.values()]
 
 
-def check_file(path: Path) -> None:
-    """Raise InputError if the file does not exist."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a file from memmlp export, or a run's folder")
-
-
-def start_session(model: str | bytes, severity: int = 2) -> onnxruntime.InferenceSession:
-    """Start an ONNX Runtime session on one thread.
-
-    Args:
-        model: path or content of an ONNX file.
-        severity: minimum severity of printed messages: 2 for warnings, 4 for fatal errors.
-    """
+def start_session(model: str | bytes) -> onnxruntime.InferenceSession:
+    """Start an ONNX Runtime session on one thread, for the path or content of an ONNX file."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = severity
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
 def open_session(path: Path) -> onnxruntime.InferenceSession:
-    """Open an ONNX file in ONNX Runtime on one thread.
-
-    Raises:
-        InputError: if the file does not exist, or ONNX Runtime cannot run it.
-    """
-    check_file(path)
+    """Open an ONNX file in ONNX Runtime on one thread. Raises InputError if this fails."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a file from memmlp export, or a run's folder")
     try:
         return start_session(str(path))
     except Exception as error:  # ONNX Runtime's own exceptions have no common base class

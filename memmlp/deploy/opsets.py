@@ -25,18 +25,16 @@ WIDENED = ("Identity", "LeakyRelu", "Where")
 
 
 class GraphConstants:
-    """The constants of a graph. New constants can be added."""
+    """The constants of a graph."""
 
     def __init__(self, graph: GraphProto):
         self.graph = graph
         self.known = {tensor.name: tensor for tensor in graph.initializer}
 
     def __contains__(self, name: str) -> bool:
-        """Return whether the graph has a constant with this name."""
         return name in self.known
 
     def get_value(self, name: str) -> np.ndarray:
-        """Return the value of a constant."""
         return numpy_helper.to_array(self.known[name])
 
     def add(self, name: str, value: np.ndarray) -> str:
@@ -58,12 +56,9 @@ class GraphConstants:
 
 
 def convert_opset(model: ModelProto, opset: int) -> ModelProto:
-    """Convert a graph from opset 18 to another opset. The results of the graph stay the same.
-
-    Raises:
-        InputError: if the opset is not in OPSETS, is unknown to the installed onnx package, or does not
-            support the graph.
-    """
+    """Convert a graph from opset 18 to another opset. The results of the graph stay the same. Raises
+    InputError if the opset is not in OPSETS, is unknown to the installed onnx package, or does not support
+    the graph."""
     newest = min(OPSETS[-1], onnx.defs.onnx_opset_version())
     if not OPSETS[0] <= opset <= newest:
         raise InputError(f"opset={opset}: must be {OPSETS[0]} to {newest}")

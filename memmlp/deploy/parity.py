@@ -23,10 +23,8 @@ MARGIN = 60  # number of frames to compare after the network's history is full
 
 @contextmanager
 def disable_sampling(model: nn.Module) -> Iterator[None]:
-    """Replace a sampled m by its mean (docs/readings.md, no. 7).
-
-    torch and ONNX Runtime cannot use the same random numbers.
-    """
+    """Replace a sampled m by its mean (docs/readings.md, no. 7), because torch and ONNX Runtime cannot use
+    the same random numbers."""
     sampled = [module for module in model.modules() if isinstance(module, Blend) and module.is_sampled]
     values = [blend.value for blend in sampled]
     try:
@@ -38,21 +36,12 @@ def disable_sampling(model: nn.Module) -> Iterator[None]:
             blend.value = value
 
 
-def select_parity_clips(model: MotionModel, clips: Sequence[Tensor], count: int = 1) -> list[Tensor]:
-    """Return the longest clips (N, 252), cut to the length that a parity check needs.
-
-    The length includes frames after the network's history is full. Errors in handling the history do not
-    show on shorter clips. The length is at least the length of the first clip.
-
-    Args:
-        model: the trained network.
-        clips: test clips (N, 252).
-        count: number of clips to return; 0 for all clips, uncut.
-    """
-    if not count:
-        return list(clips)
+def select_parity_clip(model: MotionModel, clips: Sequence[Tensor]) -> Tensor:
+    """Return the longest of some test clips (N, 252), cut to the length that a parity check needs. It
+    includes frames after the network's history is full, because errors in handling the history do not show
+    before. It is at least the length of the first clip."""
     enough = max(count_frames_until_past_is_full(model) + MARGIN, len(clips[0]))
-    return [clip[:enough] for clip in sorted(clips, key=len, reverse=True)[:count]]
+    return max(clips, key=len)[:enough]
 
 
 def count_frames_until_past_is_full(model: MotionModel) -> int:
@@ -60,20 +49,12 @@ def count_frames_until_past_is_full(model: MotionModel) -> int:
     return model.past_frames + model.frames
 
 
-def measure_largest_difference(model: MotionModel, path: Path, clip: Tensor) -> float:
-    """Return the largest difference between torch and ONNX Runtime over a clip (N, 252)."""
-    return float(measure_differences(model, path, clip).max())
-
-
 @torch.no_grad()
 def measure_differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
-    """Return each frame's largest difference (N,) between torch and ONNX Runtime over a clip (N, 252).
-
-    torch and ONNX Runtime each use their own history. If the network does not have a position branch, the
-    expected positions are computed in float64 from ONNX Runtime's rotations. Otherwise, forward kinematics
-    would amplify rounding errors a hundredfold for 6D columns that are almost parallel. Untrained networks
-    sometimes produce such columns.
-    """
+    """Return each frame's largest difference (N,) between torch and ONNX Runtime over a clip (N, 252). Each
+    uses its own history. If the network does not have a position branch, the expected positions are computed
+    in float64 from ONNX Runtime's rotations. Otherwise, forward kinematics would amplify rounding errors a
+    hundredfold for 6D columns that are almost parallel. Untrained networks sometimes produce such columns."""
     model, clip = model.cpu().eval(), clip.cpu()
     expected, exported = stream_torch(model, clip), stream_onnx(OnnxStream(path), clip)
     if "position" not in model.branches:
@@ -97,10 +78,7 @@ def are_rounding_errors(apart: Tensor) -> bool:
 
 @torch.no_grad()
 def stream_torch(model: MotionModel, clip: Tensor) -> Tensor:
-    """Return the world motion (N, 198) of the torch network, streamed over a clip (N, 252 or 54).
-
-    It runs on one thread, because several threads are slower for such small computations.
-    """
+    """Return the world motion (N, 198) of the torch network, streamed over a clip (N, 252 or 54)."""
     state, motions = model.initial_state(1), []
     with disable_sampling(model), limit_to_one_thread():
         for sparse in progress_bar(clip[:, None, None, :SPARSE_DIM], "check"):

@@ -7,7 +7,6 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.executors import Executor, Handle, Work
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import Board
-from memmlp.sweep.worker import Presence
 
 READ_INTERVAL = 0.5  # seconds between two reads of the run folders
 MIN_LIFETIME = 20.0  # seconds; a worker that ends sooner has failed to start
@@ -16,37 +15,19 @@ SUBMIT_PAUSE = 10.0  # seconds after a replacement could not be submitted; a clu
 
 
 class Fleet:
-    """The workers of a controller. A worker that died is replaced.
+    """At most `size` workers of a controller, each of which calls `work`. A worker that died is replaced.
+    `logs` is the folder of their logs, for error messages."""
 
-    Args:
-        executor: starts workers.
-        work: the function that each worker calls.
-        size: the maximum number of workers.
-        logs: the folder of the workers' logs, named in error messages.
-        presence: shows the workers that the controller is alive; the fleet keeps it from being deleted.
-    """
-
-    def __init__(
-        self,
-        executor: Executor,
-        work: Work,
-        size: int,
-        logs: Path,
-        presence: Presence | None = None,
-    ):
+    def __init__(self, executor: Executor, work: Work, size: int, logs: Path):
         self.executor, self.work, self.size, self.logs = executor, work, size, logs
-        self.presence = presence
-        self.handles: list[tuple[Handle, float]] = []
+        self.handles: list[tuple[Handle, float]] = []  # with the time of the start
         self.failed_starts = 0
         self.complaint: str | None = None
         self.next_start: float | None = None  # None before the first start
 
     def keep_workers_running(self, count: int) -> None:
-        """Start workers until `count` are running; the fleet's size is the maximum.
-
-        Raises:
-            InputError: if the first workers cannot be started, or too many in a row end soon after their
-                start while no other works.
+        """Start workers until `count` are running; the fleet's size is the maximum. Raises InputError if the
+        first workers cannot be started, or too many in a row end soon after their start while no other works.
         """
         now = time.monotonic()
         living = []
@@ -86,13 +67,9 @@ class Fleet:
 
 
 def complete_plan(plan: Plan, fleet: Fleet, board: Board) -> None:
-    """Keep the fleet working on the plan until all its tasks are done.
-
-    Other sweeps' workers may do some of the tasks; the function waits for these tasks, too. If this process
-    is interrupted, it ends its workers.
-
-    Finished runs are read again only when no task seems to remain, because a sweep may have many runs.
-    """
+    """Keep the fleet working on the plan until all its tasks are done, also those that other sweeps' workers
+    do. If this process is interrupted, it ends its workers. Finished runs are read again only when no task
+    seems to remain, because a sweep may have many runs."""
     try:
         with board:
             board.update(plan, states := plan.read_states())

@@ -25,15 +25,9 @@ FAULTY = ("failed", "damaged", "stopped", "blocked")
 
 @dataclass(frozen=True)
 class RunTask:
-    """A run that must be trained and evaluated.
-
-    Attributes:
-        id: the run's id.
-        kind: the kind of run (see `Identity`).
-        config: the resolved config of an experiment that needs the run.
-        prerequisite: the id of the run that must be done first, or None.
-        stages: the identities of the required evaluations and deployment.
-    """
+    """A run that must be trained and evaluated: its id and kind (see `Identity`), the resolved config of an
+    experiment that needs it, the id of the run that must be done first, and the identities of the required
+    evaluations and deployment."""
 
     id: str
     kind: str
@@ -64,17 +58,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Plan:
-    """The entries of a sweep, and the tasks that they need. Each task occurs once, after its prerequisite.
-
-    Attributes:
-        name: the sweep's name.
-        outputs: the folder of runs and caches.
-        entries: the runs of the sweep's variants and seeds.
-        tasks: the runs that the entries need.
-        open: whether tasks may be added later, so workers wait for them. A search's plan is open until the
-            search ends; a sweep's plan is closed.
-        cancelled: the ids of runs that workers must stop.
-    """
+    """The entries of a sweep, one for each variant and seed, and the tasks that they need. Each task occurs
+    once, after its prerequisite. `outputs` is the folder of runs and caches. If a plan is `open`, tasks may
+    be added later, so workers wait for them: a search's plan is open until the search ends; a sweep's plan is
+    closed. `cancelled` has the ids of runs that workers must stop."""
 
     name: str
     outputs: Path
@@ -88,9 +75,7 @@ class Plan:
         chosen = set(labels)
         entries = tuple(entry for entry in self.entries if entry.label in chosen)
         keys = {entry.key for entry in entries}
-        for task in reversed(
-            self.tasks
-        ):  # backwards: a task comes after its prerequisite; a prerequisite's key is its id
+        for task in reversed(self.tasks):  # prerequisites come last; their keys are their ids
             if task.key in keys and task.prerequisite:
                 keys.add(task.prerequisite)
         return replace(self, entries=entries, tasks=tuple(task for task in self.tasks if task.key in keys))
@@ -115,17 +100,11 @@ class Plan:
 
     def read_states(self, before: Mapping[str, str] | None = None) -> dict[str, str]:
         """Return the state of each task's run by the task's key; "blocked" if a prerequisite run is FAULTY.
-
-        Args:
-            before: earlier states. Tasks that were done then are not read again.
-        """
-        done = {key for key, state in (before or {}).items() if state == "done"}
-        states = {}
-        for task in self.tasks:
-            states[task.key] = (
-                "done" if task.key in done else self.get_run(task).state(self.is_complete(task))
-            )
-        return self.mark_blocked(states)
+        Tasks that were done in the states `before` are not read again."""
+        done = {key: state for key, state in (before or {}).items() if state == "done"}
+        return self.mark_blocked(
+            {t.key: done.get(t.key) or self.get_run(t).state(self.is_complete(t)) for t in self.tasks}
+        )
 
     def mark_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
         """Return the states, with "blocked" for each task after a failed prerequisite."""
@@ -137,11 +116,7 @@ class Plan:
 
     def list_remaining(self, states: Mapping[str, str] | None = None) -> list[RunTask]:
         """Return all tasks except tasks that are done, failed, blocked or cancelled; prioritized runs and
-        their prerequisites come first.
-
-        Args:
-            states: the tasks' states; by default, they are read from the run folders.
-        """
+        their prerequisites come first. By default, the states are read from the run folders."""
         states = self.read_states() if states is None else states
         ended = ("done", *FAULTY)
         left = [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
@@ -181,34 +156,25 @@ def order_tasks(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:
 
 
 class Forecast(NamedTuple):
-    """An estimate of the time that one worker needs for the remaining runs.
-
-    Attributes:
-        seconds: the time in seconds.
-        finished: the number of finished runs from which the time is estimated.
-    """
+    """An estimate of the seconds that one worker needs for the remaining runs, and the number of finished
+    runs from which it is made."""
 
     seconds: float
     finished: int
 
 
 def estimate_time(plan: Plan) -> Forecast | None:
-    """Estimate the time of the remaining runs from finished runs.
-
-    A run is estimated by the mean over its variant's finished runs, else over all finished runs of its kind.
-
-    Returns:
-        None if no run remains, or if a remaining kind of run has no finished run.
-    """
+    """Estimate the time of the remaining runs from finished runs: for a run the mean over its variant's
+    finished runs, else over all finished runs of its kind. None if no run remains, or if a remaining kind of
+    run has no finished run."""
     left = plan.list_remaining()
-    unfinished = {
-        task.id for task in left
-    }  # a trained run without all evaluations has not recorded their time
+    unfinished = {task.id for task in left}  # it may be trained, but lack evaluations
     times: dict[str, float] = {}
     kinds: dict[str, list[str]] = defaultdict(list)
     for task in plan.tasks:
-        if task.id not in unfinished and (seconds := read_run_seconds(plan.get_run(task))) is not None:
-            times[task.id] = seconds
+        run = plan.get_run(task)
+        if task.id not in unfinished and run.done and (stages := run.manifest.get("seconds")):
+            times[task.id] = sum(stages.values())
             kinds[task.kind].append(task.id)
     if not left or not all(kinds[task.kind] for task in left):
         return None
@@ -220,9 +186,3 @@ def estimate_time(plan: Plan) -> Forecast | None:
         total += fmean(times[name] for name in names)
         used |= names
     return Forecast(total, len(used))
-
-
-def read_run_seconds(run: Run) -> float | None:
-    """Return the total seconds of all stages of a finished run; None for an unfinished run."""
-    found = run.manifest.get("seconds") if run.done else None
-    return sum(found.values()) if found else None

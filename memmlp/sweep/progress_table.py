@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Self
 
 from rich import box
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -32,17 +32,14 @@ QUIET = 300.0  # seconds without a line in a log before the progress of running 
 
 
 class Screen:
-    """Shows changing content: in place on a terminal, otherwise as one line for each change.
-
-    Without a terminal, it also prints lines about running runs, at the start and after QUIET seconds without
-    a change.
-    """
+    """Shows changing content: in place on a terminal, otherwise as one line for each change, and lines about
+    running runs at the start and after QUIET seconds without a change."""
 
     last_line: float | None = None
     """The time of the last printed line, by time.monotonic; None before the first line."""
 
-    def __init__(self, console: Console | None = None):
-        self.console = console or make_console(stderr=True)
+    def __init__(self) -> None:
+        self.console = make_console(stderr=True)
         self.live = Live(console=self.console, refresh_per_second=4, transient=False)
 
     def __enter__(self) -> Self:
@@ -61,14 +58,9 @@ class Screen:
         changes: Sequence[str],
         describe_running: Callable[[], Sequence[str]],
     ) -> None:
-        """Show the whole content on a terminal; otherwise print the changes.
-
-        Args:
-            render_all: returns the whole content; called only on a terminal.
-            count: text before each line, such as "3 of 9 done".
-            changes: a line for each change since the last call.
-            describe_running: returns lines about running runs; called only if they are printed.
-        """
+        """Show the whole content on a terminal; otherwise print a line for each change since the last call,
+        or else lines about running runs, each after `count`, such as "3 of 9 done". The functions are called
+        only if their results are shown."""
         if self.console.is_terminal:
             self.live.update(render_all())
             return
@@ -116,10 +108,8 @@ def _describe_change(plan: Plan, task: RunTask, state: str) -> str:
 
 
 def describe_task(plan: Plan, task: RunTask) -> str:
-    """Return a task's readable name.
-
-    It is the variant and the seed; for a prerequisite run, the kind, the id and the seeds that need it.
-    """
+    """Return a task's readable name: the variant and the seed; for a prerequisite run, the kind, the id and
+    the seeds that need it."""
     for entry in plan.entries:
         if entry.key == task.key:
             return f"{entry.label} seed {entry.seed}"
@@ -199,11 +189,8 @@ def describe_progress(run: Run) -> str:
 
 
 def estimate_time_left(log: list[LogRecord], total: int) -> float | None:
-    """Estimate the remaining seconds of training from the log's last five entries.
-
-    Returns:
-        None before there are two entries at different steps.
-    """
+    """Estimate the remaining seconds of training from the log's last five entries; None before there are two
+    entries at different steps."""
     recent = log[-5:]
     steps, seconds = recent[-1].step - recent[0].step, recent[-1].time - recent[0].time
     if steps <= 0 or seconds <= 0:

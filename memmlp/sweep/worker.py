@@ -39,16 +39,10 @@ class Cancelled(Exception):
 
 
 def work_on_plan(path: Path, perform: Perform, should_continue: Callable[[], bool] = lambda: True) -> None:
-    """Perform the tasks of the plan in a file until no task remains.
-
-    The file is read again before each task, because the plan may have changed. An open plan may get more
-    tasks, so its workers wait for them.
-
-    Args:
-        path: the plan's file.
-        perform: finishes a task's run, or raises an exception.
-        should_continue: returns whether to go on; called before each task.
-    """
+    """Perform the tasks of the plan in a file until no task remains, or `should_continue`, called before each
+    task, returns False. The file is read again before each task, because the plan may have changed. An open
+    plan may get more tasks, so its workers wait for them. `perform` finishes a task's run, or raises an
+    exception."""
     states: Mapping[str, str] = {}
     while should_continue():
         plan = Plan.load(path)
@@ -60,27 +54,18 @@ def work_on_plan(path: Path, perform: Perform, should_continue: Callable[[], boo
 
 
 def has_controller(path: Path) -> bool:
-    """Return whether a plan is closed, or is open and its controller is alive.
-
-    A living controller touches the plan's file repeatedly. The interval since the last change is measured
-    with this process' clock, because the clock of the controller's machine may differ.
-    """
+    """Return whether a plan is closed, or is open and its controller is alive. A living controller touches
+    the plan's file repeatedly. The interval since the last change is measured with this process' clock,
+    because the clock of the controller's machine may differ."""
     if not Plan.load(path).open:
         return True
     return _changes.seconds_unchanged(path, lambda: path.stat().st_mtime_ns) < ABANDONED
 
 
 def try_task(plan: Plan, task: RunTask, perform: Perform) -> bool:
-    """Finish a task's run if its prerequisite is done and no other process works on the run.
-
-    A failure is recorded in the run's folder, and does not affect other tasks.
-
-    Returns:
-        Whether the run was free to work on: False if its prerequisite or another process blocks it.
-
-    Raises:
-        OSError: if the disk is full or read-only, which affects every task.
-    """
+    """Finish a task's run unless its prerequisite or another process blocks it; return whether it was free.
+    A failure is recorded in the run's folder, and does not affect other tasks. Raises OSError if the disk is
+    full or read-only, which affects every task."""
     run = plan.get_run(task)
     if task.prerequisite and not Run.from_id(plan.outputs, task.prerequisite).done:
         return False
@@ -121,10 +106,8 @@ def _finish_run(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
 
 
 def count_deaths(run: Run) -> int:
-    """Count the latest processes in a row that started the same stage of the run at its current step.
-
-    Processes before successful work, before an interruption, or before the last --retry, are not counted.
-    """
+    """Count the latest processes in a row that started the same stage of the run at its current step, since
+    the last successful work, interruption or --retry."""
     manifest = run.manifest
     starts = manifest.get("attempts", [])[manifest.get("forgiven", 0) :]
     last = (run.step, starts[-1].get("stage") if starts else None)
@@ -132,16 +115,13 @@ def count_deaths(run: Run) -> int:
     return sum(1 for _ in same)
 
 
-class Presence:
-    """A file that names a process and its machine, from which others see whether the process is alive."""
+def write_process_file(path: Path) -> None:
+    """Write a file with this process and its machine, from which others see whether the process is alive."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, current_process())
 
-    def __init__(self, path: Path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self.path = path
-        write_json(path, current_process())
 
-    @staticmethod
-    def is_alive(path: Path) -> bool:
-        """Return whether the process that wrote the file is alive, or may be alive on another machine."""
-        process = read_json(path)
-        return bool(process) and is_alive(process) is not False
+def is_writer_alive(path: Path) -> bool:
+    """Return whether the process that wrote the file is alive, or may be alive on another machine."""
+    process = read_json(path)
+    return bool(process) and is_alive(process) is not False

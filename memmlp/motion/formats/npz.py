@@ -16,21 +16,16 @@ The translation is `trans` or `transl` (N, 3). The frame rate is `mocap_framerat
 `fps`. If a file has several of these arrays, the first in this list is used.
 """
 
-from __future__ import annotations
-
-import io
 import math
 import warnings
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, describe_read_error
 from memmlp.common.files import atomic_file
 from memmlp.motion.body import N_JOINTS
 from memmlp.motion.clip import FRAME_RATE_RANGE, Clip
@@ -48,10 +43,8 @@ TRANSLATIONS = ("trans", "transl")
 FRAME_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 FARTHEST = 1e4  # metres from the origin
 
-BLOCK = 2**23  # maximum number of bytes per read
-MAX_HEADER = 10_000  # bytes of an npy header, as in np.load
 MAX_ROWS = 500_000  # frames: an hour at 120 Hz is 432,000
-MAX_SCALAR = 1_024  # maximum size of a scalar array, bytes
+MAX_BYTES = 2**30  # maximum unpacked size of an array; 500,000 SMPL-X frames have 660 MB
 METHODS = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED  # NumPy's; others do not limit the unpacked size
 
 
@@ -60,14 +53,14 @@ class NoMotionError(InputError):
 
 
 def read_clip(path: Path, name: str) -> Clip:
-    """Read a clip of an SMPL body in bounded memory. Pickled data is never loaded. Raises NoMotionError if
+    """Read a clip of an SMPL body. Pickled data is never loaded. Raises NoMotionError if
     the file is a valid npz without rotations, and InputError if it is damaged, has invalid shapes or values,
     or is too large. `motion.plausibility` checks whether the clip can be human motion."""
     with _open_npz(path) as file:
-        layout, trans_key, rate_key = _find_keys(file)
-        parts = [file.read_columns(key, widths[0], widths) for key, widths in layout.items()]
-        trans = file.read_columns(trans_key, 3, (3,))
-        fps = _parse_rate(path, file.read_scalar(rate_key))
+        layout, trans_key, rate_key = _find_keys(path, set(file.files))
+        parts = [_read_columns(path, file, key, widths) for key, widths in layout.items()]
+        trans = _read_columns(path, file, trans_key, (3,))
+        fps = _parse_rate(path, _read_array(path, file, rate_key))
         lengths = {len(part) for part in (*parts, trans)}
         if len(lengths) > 1:
             keys = ", ".join((*layout, trans_key))
@@ -97,16 +90,16 @@ def write_clip(path: Path, clip: Clip) -> None:
         )
 
 
-def _find_keys(file: _NpzReader) -> tuple[dict[str, tuple[int, ...]], str, str]:
-    if not any(key in file.names for layout in LAYOUTS for key in layout):
-        raise NoMotionError(f"{file.path}: has no poses, so it is not motion")
-    layout = next((layout for layout in LAYOUTS if set(layout) <= file.names), None)
-    trans = next((key for key in TRANSLATIONS if key in file.names), None)
-    rate = next((key for key in FRAME_RATES if key in file.names), None)
+def _find_keys(path: Path, names: set[str]) -> tuple[dict[str, tuple[int, ...]], str, str]:
+    if not any(key in names for layout in LAYOUTS for key in layout):
+        raise NoMotionError(f"{path}: has no poses, so it is not motion")
+    layout = next((layout for layout in LAYOUTS if set(layout) <= names), None)
+    trans = next((key for key in TRANSLATIONS if key in names), None)
+    rate = next((key for key in FRAME_RATES if key in names), None)
     if layout is None or trans is None or rate is None:
         keys = {"poses": layout, "trans": trans, "mocap_framerate": rate}
         missing = ", ".join(key for key, value in keys.items() if value is None)
-        raise InputError(f"{file.path}: has no {missing}, so it is not AMASS motion")
+        raise InputError(f"{path}: has no {missing}, so it is not AMASS motion")
     return layout, trans, rate
 
 
@@ -120,131 +113,53 @@ def _parse_rate(path: Path, value: np.ndarray) -> float:
         item = value.item()
         fps = float(item.decode() if isinstance(item, bytes) else item)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: the frame rate is not a number ({_shorten_error(error)})") from error
+        raise InputError(f"{path}: the frame rate is not a number ({error})") from error
     low, high = FRAME_RATE_RANGE
     if not low <= fps <= high:
         raise InputError(f"{path}: the frame rate is {fps:g} Hz; must be from {low:g} to {high:g} Hz")
     return fps
 
 
-# Arrays are read in bounded memory. Before an array is allocated, its header is compared with its size in
-# the zip's directory and with the limits above. Then the array is read in blocks. For damaged bytes,
-# `zipfile` and `numpy.lib.format` raise undocumented exceptions, such as tokenize.TokenError or struct.error.
-# So any exception from these modules means a bad file.
+def _read_array(path: Path, file: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
+    """Read an array, after a check of its unpacked size."""
+    info = file.zip.getinfo(f"{key}.npy")
+    if info.compress_type not in METHODS:
+        raise InputError(
+            f"{path}: {key} has compression method {info.compress_type}; must be stored or deflate"
+        )
+    if info.file_size > MAX_BYTES:
+        raise InputError(f"{path}: {key} has {info.file_size} bytes; must have at most {MAX_BYTES}")
+    return file[key]
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The header of an npy file; `offset` is the number of bytes before the data."""
-
-    shape: tuple[int, ...]
-    fortran: bool
-    dtype: np.dtype
-    offset: int
-
-    def __str__(self) -> str:
-        return f"{self.dtype} {self.shape}"
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape) * self.dtype.itemsize
-
-
-class _NpzReader:
-    def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
-        self.path = path
-        self._zip = archive
-        self.names = {name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")}
-
-    def read_header(self, name: str) -> _Header:
-        info = self._zip.getinfo(f"{name}.npy")
-        if info.compress_type not in METHODS:
-            raise InputError(
-                f"{self.path}: {name} has compression method {info.compress_type}; must be stored or deflate"
-            )
-        with self._zip.open(info) as entry:
-            header = _parse_header(entry.read(MAX_HEADER))
-        if min(header.shape, default=0) < 0 or header.offset + header.size != info.file_size:
-            raise InputError(f"{self.path}: {name} has type and shape {header}, but {info.file_size} bytes")
-        return header
-
-    def read_scalar(self, name: str) -> np.ndarray:
-        header = self.read_header(name)
-        if header.size > MAX_SCALAR:
-            raise InputError(f"{self.path}: {name} has type and shape {header}; must be one number")
-        with self._zip.open(f"{name}.npy") as entry:
-            entry.seek(header.offset)
-            return np.frombuffer(entry.read(), header.dtype).reshape(header.shape)
-
-    def read_columns(self, name: str, count: int, widths: Collection[int]) -> np.ndarray:
-        """Read the first `count` columns of an array (N, columns) or (N, J, 3) as float64. The number of
-        columns must be in `widths`."""
-        header = self.read_header(name)
-        shape = header.shape
-        flat = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and not header.fortran)
-        rows, width = (shape[0], math.prod(shape[1:])) if flat else (0, 0)
-        if header.dtype.kind != "f" or width not in widths:
-            expected = " or ".join(f"(N, {width})" for width in widths)
-            raise InputError(f"{self.path}: {name} has type and shape {header}; must be floats {expected}")
-        if not 0 < rows <= MAX_ROWS:
-            raise InputError(
-                f"{self.path}: {name} has type and shape {header}; must have 1 to {MAX_ROWS} frames"
-            )
-        columns = np.empty((rows, count))
-        with self._zip.open(f"{name}.npy") as entry:
-            entry.seek(header.offset)
-            if header.fortran:
-                for start, block in _read_lines(entry, header.dtype, width, rows):
-                    some = block[: max(0, count - start)]
-                    columns[:, start : start + len(some)] = some.T
-            else:
-                for start, block in _read_lines(entry, header.dtype, rows, width):
-                    columns[start : start + len(block)] = block[:, :count]
-        return columns
+def _read_columns(path: Path, file: np.lib.npyio.NpzFile, key: str, widths: Sequence[int]) -> np.ndarray:
+    """Read the first `widths[0]` columns of an array (N, columns) or (N, J, 3) as float64. The number of
+    columns must be in `widths`."""
+    array = _read_array(path, file, key)
+    found = f"{path}: {key} has type and shape {array.dtype} {array.shape}"
+    is_flat = array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)
+    if array.dtype.kind != "f" or not is_flat or math.prod(array.shape[1:]) not in widths:
+        raise InputError(f"{found}; must be floats {' or '.join(f'(N, {width})' for width in widths)}")
+    if not 0 < len(array) <= MAX_ROWS:
+        raise InputError(f"{found}; must have 1 to {MAX_ROWS} frames")
+    return array.reshape(len(array), -1)[:, : widths[0]].astype(np.float64)
 
 
 @contextmanager
-def _open_npz(path: Path) -> Iterator[_NpzReader]:
-    """Open an npz file. Damaged bytes raise InputError within the whole context."""
+def _open_npz(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
+    """Open an npz file. Damaged bytes raise InputError within the whole context: for these, `zipfile` and
+    NumPy raise undocumented exceptions, such as tokenize.TokenError or struct.error."""
     try:
-        with open(path, "rb") as raw:
-            magic = raw.read(2)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    if magic != b"PK":
-        raise InputError(f"{path}: not a zip, so not an npz file; convert BVH files with memmlp data import")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            yield _NpzReader(path, archive)
+        with open(path, "rb") as raw, warnings.catch_warnings():
+            if raw.read(2) != b"PK":
+                expected = "convert BVH files with memmlp data import"
+                raise InputError(f"{path}: not a zip, so not an npz file; {expected}")
+            raw.seek(0)
+            warnings.simplefilter("ignore")  # about headers written by Python 2, and about unusual escapes
+            with np.load(raw, allow_pickle=False) as file:
+                yield file
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"{path}: cannot be read as npz ({_shorten_error(error)})") from error
-
-
-def _shorten_error(error: Exception) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__
-
-
-def _parse_header(start: bytes) -> _Header:
-    """Parse an npy header from the first bytes of the file. Any exception means a damaged header."""
-    stream = io.BytesIO(start)
-    version = np.lib.format.read_magic(stream)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise ValueError(f"an npy header of version {version}")
-    with warnings.catch_warnings():  # about headers written by Python 2, and about unusual escapes
-        warnings.simplefilter("ignore")
-        shape, fortran, dtype = readers[version](stream, max_header_size=MAX_HEADER)
-    return _Header(shape, fortran, dtype, stream.tell())
-
-
-def _read_lines(
-    entry: IO[bytes], dtype: np.dtype, count: int, length: int
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield blocks (n, length) of `count` rows, each with the index of its first row."""
-    step = max(1, BLOCK // (length * dtype.itemsize))
-    for start in range(0, count, step):
-        lines = min(step, count - start)
-        data = entry.read(lines * length * dtype.itemsize)
-        yield start, np.frombuffer(data, dtype).reshape(lines, length)
+        reason = describe_read_error(error)[:120] or type(error).__name__
+        raise InputError(f"{path}: cannot be read as npz ({reason})") from error

@@ -24,13 +24,9 @@ class Handle(Protocol):
 
 
 class Executor(Protocol):
-    """Starts workers.
+    """Starts workers."""
 
-    Attributes:
-        gpus: whether each worker gets a GPU.
-    """
-
-    gpus: bool
+    gpus: bool  # whether each worker gets a GPU
 
     def submit(self, work: Work, count: int = 1) -> Sequence[Handle]:
         """Start `count` workers. `work` must be picklable, and importable on the workers' machines."""

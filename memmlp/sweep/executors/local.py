@@ -33,10 +33,8 @@ GpuGroup = tuple[str, ...]
 
 
 def list_visible_gpus() -> GpuGroup:
-    """Return the names of the GPUs that this process may use, as in CUDA_VISIBLE_DEVICES.
-
-    Like in CUDA, a negative number hides its entry and all later entries.
-    """
+    """Return the names of the GPUs that this process may use, as in CUDA_VISIBLE_DEVICES. Like in CUDA, a
+    negative number hides its entry and all later entries."""
     text = os.environ.get(VISIBLE)
     if text is None:
         if version("torch").endswith("+cpu"):  # torch's import takes 1 s
@@ -49,15 +47,8 @@ def list_visible_gpus() -> GpuGroup:
 
 
 def divide_gpus(gpus: GpuGroup, per_worker: int | None = None) -> list[GpuGroup]:
-    """Divide the GPUs into groups of `per_worker` GPUs, one group for each worker. The rest stays idle.
-
-    Args:
-        gpus: the visible GPUs.
-        per_worker: the number of GPUs per worker; None for 1 if there are GPUs. With 0 there are no groups.
-
-    Raises:
-        InputError: if `per_worker` is greater than the number of GPUs.
-    """
+    """Divide the GPUs into groups of `per_worker` GPUs (None for 1, 0 for no groups), one group for each
+    worker. The rest stays idle. Raises InputError if `per_worker` is greater than the number of GPUs."""
     size = per_worker if per_worker is not None else min(len(gpus), 1)
     if size > len(gpus):
         names = ", ".join(gpus) or "no GPU"
@@ -68,16 +59,9 @@ def divide_gpus(gpus: GpuGroup, per_worker: int | None = None) -> list[GpuGroup]
 
 
 def count_workers(gpu_groups: Sequence[GpuGroup], workers: int | None, per_gpu: int | None) -> int:
-    """Return the number of workers that run at once.
-
-    Args:
-        gpu_groups: the GPU groups that workers may get; empty if workers have no GPUs.
-        workers: the requested number; None for one per GPU group, or without GPUs one per core.
-        per_gpu: the maximum number of workers per GPU group; None for no limit.
-
-    Raises:
-        InputError: if the number exceeds `per_gpu`, or if `per_gpu` is given without GPUs.
-    """
+    """Return the number of workers that run at once: `workers`, or None for one per GPU group, or without
+    GPUs one per core. Raises InputError if there are more than `per_gpu` per GPU group, or if `per_gpu` is
+    given without GPUs; None sets no limit."""
     if not gpu_groups:
         if per_gpu:
             raise InputError(f"--workers-per-gpu {per_gpu}: this machine has no GPUs for workers")
@@ -89,32 +73,25 @@ def count_workers(gpu_groups: Sequence[GpuGroup], workers: int | None, per_gpu: 
 
 
 class Worker:
-    """A worker that is a process of this machine."""
+    """A worker that is a process of this machine. It releases its run before it ends."""
 
     def __init__(self, process: subprocess.Popen[bytes], folder: Path):
         self.process, self.folder = process, folder
         threading.Thread(target=process.wait, daemon=True).start()  # reaps the process
 
     def alive(self) -> bool:
-        """Return whether the process is working."""
         return self.process.poll() is None
 
     def cancel(self) -> None:
-        """Terminate the process. It releases its run first."""
         self.process.terminate()
 
     def complaint(self) -> str | None:
-        """Return the line that explains why the worker could not work; None after any other end."""
         return read_complaint(self.folder)
 
 
 class LocalExecutor:
-    """Starts workers as processes of this machine, each with a GPU group.
-
-    Args:
-        folder: the folder of the workers' logs, with %j in place of a worker's name.
-        gpu_groups: the GPU groups that workers may get; empty for workers without GPUs.
-    """
+    """Starts workers as processes of this machine, each with one of the GPU groups; without groups, they have
+    no GPUs. `folder` is that of the workers' logs, with %j in place of a worker's name."""
 
     def __init__(self, folder: Path, gpu_groups: Sequence[GpuGroup] = ()):
         self.folder = folder
@@ -153,24 +130,15 @@ def read_complaint(folder: Path) -> str | None:
     return path.read_text(encoding="utf-8") if path.exists() else None
 
 
-def start_process(
-    work: Work, folder: Path, environment: Mapping[str, str], with_parent: bool = False
-) -> subprocess.Popen[bytes]:
-    """Start a Python process that does the work, with its output in the folder's `log.txt`.
-
-    Args:
-        work: the work; a returned line is written to the file LINE.
-        folder: a new folder.
-        environment: additional environment variables.
-        with_parent: whether the new process ends when this process ends.
-    """
+def start_process(work: Work, folder: Path, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+    """Start a Python process that does the work, with additional environment variables, and its output in the
+    `log.txt` of the new folder. A returned line is written to the file LINE."""
     prepare_work(work, folder)
-    command = [sys.executable, "-u", "-m", __name__, str(folder), *(["follow"] if with_parent else [])]
     with open(folder / LOG, "ab") as log:
         return subprocess.Popen(
-            command,
+            [sys.executable, "-u", "-m", __name__, str(folder)],
             env={**os.environ, **build_import_variables(), **environment},
-            stdin=subprocess.PIPE if with_parent else subprocess.DEVNULL,
+            stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             start_new_session=True,  # Ctrl-C reaches only the controller, which then ends its workers
@@ -178,10 +146,8 @@ def start_process(
 
 
 def do_work(folder: Path) -> None:
-    """Do the work that is pickled in a worker's folder. It is called in the worker's process.
-
-    The pickle is kept, because a cluster may start the worker again.
-    """
+    """Do the work that is pickled in a worker's folder. It is called in the worker's process. The pickle is
+    kept, because a cluster may start the worker again."""
     collect_garbage_rarely()
     print_in_any_encoding()
     work: Work = pickle.loads((folder / WORK).read_bytes())
@@ -206,14 +172,6 @@ def _beat(folder: Path) -> None:
     threading.Thread(target=touch_regularly, daemon=True).start()
 
 
-def _end_with_parent() -> None:
-    while os.read(
-        sys.stdin.fileno(), 1
-    ):  # not sys.stdin.read, because the process would wait for its buffer at exit
-        pass
-    os._exit(1)
-
-
 class DebugWorker:
     """A worker inside this process. Its work is done during the first call of `alive`."""
 
@@ -222,17 +180,15 @@ class DebugWorker:
         self.line: str | None = None
 
     def alive(self) -> bool:
-        """Do the work if it has not been done, and return False."""
         if self.work:
             work, self.work = self.work, None
             self.line = work()
         return False
 
     def cancel(self) -> None:
-        """Do nothing, because the work is either done or not started."""
+        pass  # the work is either done or not started
 
     def complaint(self) -> str | None:
-        """Return the line that the work returned."""
         return self.line
 
 
@@ -242,13 +198,10 @@ class DebugExecutor:
     gpus = False
 
     def submit(self, work: Work, count: int = 1) -> list[DebugWorker]:
-        """Make workers. Each works during the first call of its `alive`."""
         return [DebugWorker(work) for _ in range(count)]
 
 
 if __name__ == "__main__":
-    if "follow" in sys.argv[2:]:
-        threading.Thread(target=_end_with_parent, daemon=True).start()
     if "beat" in sys.argv[2:]:
         _beat(Path(sys.argv[1]))
     try:

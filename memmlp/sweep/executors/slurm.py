@@ -28,10 +28,7 @@ PATIENCE = 60.0  # seconds until a command of Slurm counts as failed
 HELD = "launch failed requeued held"  # Slurm's reason for a job that it does not start again by itself
 WARNING = 90  # seconds before the time limit at which a job is queued again; Slurm may be a minute early
 MIN_WARNED_MINUTES = 4  # a shorter job has no time for the warning
-KEPT_VARIABLES = (
-    "SLURM_CONF",
-    "SLURM_CLUSTERS",
-)  # the others describe the job of this process, not the worker's
+KEPT_VARIABLES = ("SLURM_CONF", "SLURM_CLUSTERS")  # others describe this process' job, not the worker's
 
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
 RESERVED = ("array", "output", "error", "open_mode", "signal", "wrap", "wait", "parsable", "test_only")
@@ -40,15 +37,10 @@ FIXED_TO_ONE = ("nodes", "ntasks", "ntasks_per_node", "ntasks_per_gpu")  # since
 
 @dataclass(frozen=True)
 class SlurmOptions:
-    """The options of submitted jobs.
-
-    Attributes:
-        parameters: sbatch's options by long name, with _ in place of -; True for an option without a value.
-        srun: arguments for srun, which starts the worker inside the job.
-        setup: a shell command that each job runs first, or None.
-        python: the command that starts Python in the job; None for the Python of this process.
-        minutes: the time limit in minutes.
-    """
+    """The options of submitted jobs: sbatch's `parameters` by long name, with _ in place of -, True for an
+    option without a value; arguments for srun, which starts the worker inside the job; a shell command that
+    each job runs first; the command that starts Python in the job, None for the Python of this process; and
+    the time limit in minutes."""
 
     parameters: Mapping[str, str | bool] = field(default_factory=dict)
     srun: tuple[str, ...] = ()
@@ -65,11 +57,8 @@ class SlurmOptions:
 
 
 def parse_slurm_options(settings: Mapping[str, str]) -> SlurmOptions:
-    """Return the options for settings `slurm.KEY=VALUE`.
-
-    Raises:
-        InputError: for an invalid value, and for an option that memmlp sets itself.
-    """
+    """Return the options for settings `slurm.KEY=VALUE`. Raises InputError for an invalid value, and for an
+    option that memmlp sets itself."""
     values = {key.replace("-", "_"): value for key, value in settings.items()}
     setup, python = values.pop("setup", None), values.pop("python", None)
     srun = shlex.split(values.pop("srun", ""))
@@ -123,14 +112,8 @@ class Queue:
     """The queued and running jobs of this user, read at most every QUEUE_INTERVAL."""
 
     def __init__(self, clusters: Sequence[str]):
-        self.command = [
-            "squeue",
-            "--noheader",
-            "--array",
-            f"--user={os.getuid()}",
-            "--format=%i %T %r",
-            *clusters,
-        ]
+        options = ["--noheader", "--array", f"--user={os.getuid()}", "--format=%i %T %r"]
+        self.command = ["squeue", *options, *clusters]
         self.states: dict[str, str] | None = None
         self.read_time = -math.inf
 
@@ -145,26 +128,17 @@ class Queue:
 
 
 class Job:
-    """A worker that is a job of Slurm.
-
-    Args:
-        name: the job's name in Slurm, such as 42_0.
-        folder: the worker's folder.
-        queue: the queue of this user.
-        clusters: the option for Slurm's commands that chooses the cluster, or nothing.
-    """
+    """A worker that is a job of Slurm, with a name such as 42_0. `clusters` is the option for Slurm's
+    commands that chooses the cluster, or empty."""
 
     def __init__(self, name: str, folder: Path, queue: Queue, clusters: Sequence[str]):
         self.name, self.folder, self.queue, self.clusters = name, folder, queue, clusters
         self._timer = ChangeTimer()
 
     def alive(self) -> bool:
-        """Return whether the job waits or works.
-
-        A job that Slurm lists is cancelled if its worker began and is silent: Slurm did not notice its death,
-        or has queued the job again, where it waits for minutes. A job that failed to start is also cancelled:
-        Slurm holds it for ever.
-        """
+        """Return whether the job waits or works. A job that Slurm lists is cancelled if its worker began and
+        is silent: Slurm did not notice its death, or has queued the job again, where it waits for minutes. A
+        job that failed to start is also cancelled: Slurm holds it for ever."""
         state = self.queue.find_state(self.name)
         if state == "":
             return False
@@ -179,7 +153,6 @@ class Job:
 
     @property
     def began(self) -> bool:
-        """Whether the worker began to work."""
         return (self.folder / HEARTBEAT).exists()
 
     def _count_silent_seconds(self) -> float:
@@ -190,26 +163,17 @@ class Job:
         return self._timer.seconds_unchanged(self.name, read)
 
     def cancel(self) -> None:
-        """End the job."""
         call_slurm(["scancel", *self.clusters, self.name])
 
     def complaint(self) -> str | None:
-        """Return the line that explains why the worker could not work; None after any other end."""
         if not self.began:
             return f"job {self.name} ended before its worker began"
         return read_complaint(self.folder)
 
 
 class Slurm:
-    """Starts workers as jobs of the Slurm cluster of this machine.
-
-    Args:
-        folder: the folder of the workers' logs, with %j in place of a name.
-        options: the options of the jobs.
-
-    Raises:
-        InputError: if Slurm is not installed, or could not use the folder.
-    """
+    """Starts workers as jobs of the Slurm cluster of this machine. `folder` is that of the workers' logs,
+    with %j in place of a name. Raises InputError if Slurm is not installed, or could not use the folder."""
 
     def __init__(self, folder: Path, options: SlurmOptions):
         _check_folder(folder)
@@ -217,9 +181,8 @@ class Slurm:
             raise InputError("executor=slurm: Slurm is not installed on this machine (sbatch not found)")
         self.folder, self.options = folder, options
         self.gpus = options.gpu
-        self.clusters = [
-            f"--clusters={name}" for key, name in options.parameters.items() if key == "clusters"
-        ]
+        clusters = options.parameters.get("clusters")
+        self.clusters = [f"--clusters={clusters}"] if clusters else []
         self.queue = Queue(self.clusters)
 
     def submit(self, work: Work, count: int = 1) -> list[Job]:
@@ -258,15 +221,9 @@ def call_slurm(command: Sequence[str]) -> list[str] | None:
 
 
 def format_batch_script(folder: Path, options: SlurmOptions, workers: int) -> str:
-    """Return the text of the sbatch script for this number of workers, also on machines without Slurm.
-
-    A job queues itself again before its time limit, so that the runs go on also without a controller.
-
-    Args:
-        folder: the folder of the workers; worker N has its subfolder N.
-        options: the options of the jobs.
-        workers: the number of workers.
-    """
+    """Return the text of the sbatch script for this number of workers, also on machines without Slurm. Worker
+    N has the subfolder N of the folder. A job queues itself again before its time limit, so that the runs go
+    on also without a controller."""
     _check_folder(folder)
     parameters: dict[str, str | bool] = {"job_name": "memmlp", "requeue": True, **options.parameters}
     parameters |= {"array": f"0-{workers - 1}", "output": f"{folder}/%a/log.txt", "open_mode": "append"}
