@@ -178,7 +178,7 @@ def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[st
     request."""
     from memmlp.config.worker_process import work
     from memmlp.sweep.controller import Fleet
-    from memmlp.sweep.worker import Presence
+    from memmlp.sweep.worker import write_process_file
 
     named = set(devices)
     shares = workers.make_gpu_shares(named)
@@ -188,9 +188,9 @@ def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[st
     stem = folder / "controllers" / uuid4().hex
     path = stem.with_suffix(".json")
     plan.save(path)
-    presence = Presence(stem.with_suffix(".process"))
+    write_process_file(process := stem.with_suffix(".process"))
     gpu = executor.gpus and may_use_gpu
     local = workers.executor == "local"
     threads = max(count_usable_cores() // count, 1) if local else 0
-    job = partial(work, str(path), threads, str(presence.path) if local else None, gpu)
-    return path, Fleet(executor, job, count, folder / "workers", presence)
+    job = partial(work, str(path), threads, str(process) if local else None, gpu)
+    return path, Fleet(executor, job, count, folder / "workers")

@@ -11,16 +11,17 @@ from memmlp.training.request import RunRequest
 
 def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | None:
     """Perform the tasks of the plan in a file. `threads` is the number of torch's threads if the config does
-    not set it; 0 for torch's default. `controller` is the file of the controller's `Presence`; the worker
-    ends with it. A worker without it, on another machine, finishes a closed plan, and leaves an open plan
-    when the controller no longer touches the plan's file. If a worker needs a `gpu` and
-    finds no GPU, it does nothing and returns a line that says why; otherwise return None."""
+    not set it; 0 for torch's default. `controller` is the file that shows whether the controller is alive
+    (`write_process_file`); the worker ends with it. A worker without it, on another machine, finishes a
+    closed plan, and leaves an open plan when the controller no longer touches the plan's file. If a worker
+    needs a `gpu` and finds no GPU, it does nothing and returns a line that says why; otherwise return None.
+    """
     if gpu:
         from memmlp.training import devices  # it imports torch
 
         if line := devices.describe_missing_gpu():
             return line
-    alive, file = (Presence.is_alive, controller) if controller else (has_controller, path)
+    alive, file = (is_writer_alive, controller) if controller else (has_controller, path)
     work_on_plan(Path(path), partial(perform_task, Path(path), threads), partial(alive, Path(file)))
     return None
 

@@ -57,7 +57,7 @@ PLACES = (
     ("left_elbow", "left_shoulder"), ("right_elbow", "right_shoulder"), ("head", "head"),
 )  # fmt: skip
 AT, TURNS_WITH = ([JOINTS.index(pair[k]) for pair in PLACES] for k in (0, 1))
-NAMES = (*map(str, range(1, len(PLACES))), "head")
+TRACKERS = (*map(str, range(1, len(PLACES))), "head")
 
 
 class Output(Protocol):
@@ -148,17 +148,13 @@ class Receiver:
             if error.errno not in (errno.EAGAIN, errno.ENOBUFS):
                 raise
 
-    def close(self) -> None:
-        """Close the socket."""
-        self.socket.close()
-
 
 class VMC:
     """An output that sends bones to a VMC program."""
 
     def __init__(self, receiver: Receiver):
         self.name = f"VMC to {receiver}"
-        self.receiver, self.close = receiver, receiver.close
+        self.receiver, self.close = receiver, receiver.socket.close
         self.start: float | None = None
 
     def take(self, frame: BodyFrame) -> None:
@@ -184,13 +180,14 @@ class VRChat:
 
     def __init__(self, receiver: Receiver):
         self.name = f"VRChat at {receiver}"
-        self.receiver, self.close = receiver, receiver.close
+        self.receiver, self.close = receiver, receiver.socket.close
 
     def take(self, frame: BodyFrame) -> None:
         """Send the frame's trackers, in one datagram."""
-        parts = [f"/tracking/trackers/{name}/{part}" for name in NAMES for part in ("position", "rotation")]
+        parts = [f"{name}/{part}" for name in TRACKERS for part in ("position", "rotation")]
         vectors = place_trackers(frame).reshape(-1, 3).tolist()
-        self.receiver.send(encode_osc(zip(parts, ["fff"] * len(parts), vectors, strict=True)))
+        pairs = zip(parts, vectors, strict=True)
+        self.receiver.send(encode_osc((f"/tracking/trackers/{part}", "fff", v) for part, v in pairs))
 
 
 def place_trackers(frame: BodyFrame) -> np.ndarray:

@@ -68,16 +68,12 @@ def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
 
 
 class BodyTree:
-    """A body: its joints, their hierarchy and their rest pose. It computes forward kinematics of one frame.
+    """A body: J joints, the indices of their parents (-1 for the root, which is the first joint), and the
+    rest pose (J, 3), metres, SMPL's body frame. It computes forward kinematics of one frame.
 
     The computation doubles the chain of transforms in each step. Step k multiplies the transform of each
     joint by the transform of the ancestor 2^k levels above. So a tree of depth 8 needs three batched products
     instead of eight.
-
-    Args:
-        joints: joint names (J).
-        parents: indices of the parent joints (J); -1 for the root, which is the first joint.
-        rest: joint positions in the rest pose (J, 3), metres, SMPL's body frame.
 
     Attributes:
         tracked: the indices of head, left and right wrist.

@@ -44,19 +44,10 @@ RotationFormat = Literal["matrix", "quaternion"]
 
 
 class ExportedNetwork(OnnxStream):
-    """An exported network with scope `step`, and its metadata. `OnnxStream` runs the steps.
-
-    Attributes:
-        sparse: the input (1, 54). Write it before a step.
-        rotation6d, position: the outputs (22, 6) and (22, 3). The next step overwrites them.
-        body: joints, hierarchy and rest pose.
-        fps: frames per second.
-        frames: the window's length T.
-        has_position_branch: whether the network predicts positions.
-
-    Raises:
-        InputError: if the file is not an exported network with scope `step`, or its metadata are incomplete.
-    """
+    """An exported network with scope `step`, and its metadata. `OnnxStream` runs the steps. `sparse` is the
+    input (1, 54); `rotation6d` (22, 6) and `position` (22, 3) are the outputs, which the next step
+    overwrites. `frames` is the window's length T. Raises InputError if the file is not an exported network
+    with scope `step`, or its metadata are incomplete."""
 
     def __init__(self, path: Path):
         super().__init__(path)
@@ -108,24 +99,14 @@ class Pose(NamedTuple):
 
 
 class BodyFrame(NamedTuple):
-    """The user's body at one time, in AMASS' conventions, with the floor at height zero.
-
-    Attributes:
-        time: seconds of the trackers' clock.
-        local: local rotations (22, 3, 3); the root rotation is global.
-        positions: joints (22, 3), metres, by forward kinematics of the rotations.
-        position_branch: joints (22, 3), metres, from the position branch.
-        rest: rest joints (22, 3), metres, SMPL's body frame, scaled to the user's height.
-        scale: the network's body height divided by the user's.
-        held, fresh, restarted: see `Pose`.
-    """
+    """The user's body at one time, in AMASS' conventions, with the floor at height zero; see `Pose`."""
 
     time: float
-    local: np.ndarray
+    local: np.ndarray  # local rotations (22, 3, 3); the root rotation is global
     positions: np.ndarray
     position_branch: np.ndarray
-    rest: np.ndarray
-    scale: float
+    rest: np.ndarray  # rest joints (22, 3), metres, SMPL's body frame, scaled to the user's height
+    scale: float  # the network's body height divided by the user's
     held: tuple[str, ...]
     fresh: bool
     restarted: bool
@@ -209,14 +190,10 @@ class Stream:
         return self.network.body.rest / self.wearer.scale
 
     def fit(self, height: float | None = None, floor: float = 0.0) -> None:
-        """Set the body height (metres; None for the network's height) and the floor (metres), and restart.
-
-        A new height removes the offsets and causes a `SampleWarning`, because they would move the hands by
-        some centimetres. Calibrate again, or set `offsets` after this call.
-
-        Raises:
-            InputError: if height or floor is out of range.
-        """
+        """Set the body height (metres; None for the network's height) and the floor (metres), and restart. A
+        new height removes the offsets and causes a `SampleWarning`, because they would move the hands by some
+        centimetres. Calibrate again, or set `offsets` after this call. Raises InputError if height or floor
+        is out of range."""
         before = self.wearer.height
         self.wearer = make_wearer(self.network.body, height, floor)
         self.reset()

@@ -112,15 +112,14 @@ def _read_poses(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray
 
 def check_time(time: float | None) -> None:
     """Raise InputError unless `time` is a time in seconds or None."""
-    if time is None:
-        return
-    if not isinstance(time, (int, float, np.integer, np.floating)) or not abs(time) <= LATEST:
+    is_number = isinstance(time, (int, float, np.integer, np.floating))
+    if time is not None and not (is_number and abs(time) <= LATEST):
         raise InputError(f"time={time}: must be seconds, at most {LATEST:g}, or None")
 
 
 ODD = {
     "jump": (
-        JUMPS,
+        JUMPS,  # times in milliseconds jump at every sample
         f"have times over {GAP:g} s apart, and each restarts the network; check that `time` is in seconds",
     ),
     "still": (
@@ -128,7 +127,7 @@ ODD = {
         "have times that do not increase, and give no frames; check that `time` does not stand still",
     ),
     "coarse": (
-        STILL,
+        STILL,  # single precision, such as OSC's `f`, is coarse after some hours
         "have times in single precision, which are too coarse for velocities; send `time` in double "
         "precision (OSC's d), or count from the start",
     ),
@@ -150,16 +149,8 @@ def warn_caller(line: str) -> None:
 
 
 class OddSamples:
-    """Detects odd samples of a stream, and warns once per kind.
-
-    - Times in milliseconds jump at every sample. Each jump restarts the network.
-    - A clock that stands still gives no frames.
-    - Times in single precision, such as OSC's `f`, are coarse after some hours. Then velocities are wrong.
-    - Positions in other units than metres are far apart or high.
-
-    Args:
-        report: gets a line at the first detection of each kind. By default, it issues a `SampleWarning`.
-    """
+    """Detects odd samples of a stream. At the first detection of each kind (`ODD`), `report` gets a line; by
+    default, it issues a `SampleWarning`."""
 
     def __init__(self, report: Callable[[str], None] = warn_caller):
         self.report, self.reported = report, set[str]()

@@ -102,7 +102,6 @@ class FullStep(nn.Module):
         self.register_buffer("bones", torch.tensor(tree.bone_offsets, dtype=torch.float32)[None, ..., None])
 
     def initial_state(self) -> dict[str, Tensor]:
-        """Return the initial states, all zeros."""
         own = {f"trackers.{name}": torch.zeros(shape) for name, shape in OWN.items()}
         return own | self.model.initial_state(1)
 

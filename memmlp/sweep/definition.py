@@ -1,7 +1,4 @@
-"""A sweep: its variants, their overrides, its seeds, and the copy of the sweep beside its plan.
-
-`memmlp.sweep.sweep_file` reads sweep files.
-"""
+"""A sweep: its variants, their overrides, its seeds, and the copy of the sweep beside its plan."""
 
 from __future__ import annotations
 
@@ -26,10 +23,8 @@ SIZES = ("FLOPs", "MACs", "parameters", "size")
 TIMES = ("ms", "network ms", "pose ms", "ratio", "FPS")
 """The costs that are derived from measured times, so repeated measurements differ slightly."""
 COSTS = (*SIZES, *TIMES)
-"""Metrics that are costs, not errors.
-
-Units: GFLOP, GMAC, millions, MB, ms, multiples of the reference network's time, and frames per second.
-"""
+"""Metrics that are costs, not errors, in GFLOP, GMAC, millions, MB, ms, multiples of the reference network's
+time, and frames per second."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +61,7 @@ class Variant:
 
     @property
     def own_overrides(self) -> tuple[str, ...]:
-        """The variant's overrides without the overrides of its cell."""
+        """The overrides without those of the cell."""
         return tuple(text for text in self.overrides or () if text not in self.cell)
 
 
@@ -112,11 +107,8 @@ class Sweep:
     smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
 
     def with_branch(self, branch: str) -> Sweep:
-        """Return the sweep with variants that show this branch.
-
-        A variant keeps a branch that the file sets for it. The paper's values belong to the printed branch,
-        so a variant loses them when its branch changes.
-        """
+        """Return the sweep with variants that show this branch, except where the file sets a variant's own.
+        The paper's values belong to the printed branch, so a variant loses them when its branch changes."""
         variants = tuple(
             one if one.fixed or one.branch == branch else replace(one, branch=branch, paper={})
             for one in self.variants
@@ -124,10 +116,8 @@ class Sweep:
         return self if variants == self.variants else replace(self, variants=variants, branch_source=None)
 
     def find_control(self, variant: Variant) -> str | None:
-        """Return the label of a variant's control: `against` if it is set, else the sweep's control.
-
-        The result is None for the sweep's control if it does not set `against`.
-        """
+        """Return the label of a variant's control: `against` if it is set, else the sweep's control, or None
+        for this control itself."""
         return variant.against or (self.control if variant.label != self.control else None)
 
     def get_seeds(self, variant: Variant) -> tuple[int, ...]:
@@ -136,13 +126,8 @@ class Sweep:
 
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
         """Return the sweep with further overrides, applied after its base and before the variants' overrides.
-
-        `seed=0,1` or `seed=0` sets the seeds.
-
-        Raises:
-            InputError: for `paths.outputs`, which `--outputs` sets; for `save_predictions`; and for a key
-                that a variant sets to a value, because that value would win.
-        """
+        `seed=0,1` or `seed=0` sets the seeds. Raises InputError for `paths.outputs`, which `--outputs` sets;
+        for `save_predictions`; and for a key that a variant sets to a value, because that value would win."""
         keys = [parse_key(text) for text in overrides]
         if "paths.outputs" in keys:
             raise InputError("paths.outputs: expected --outputs FOLDER, or MEMMLP_OUTPUTS")
@@ -180,11 +165,8 @@ class Sweep:
         return tuple(variant for variant in self.variants if variant.overrides is not None)
 
     def select_labels(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return the given labels; without any, the labels of all variants that can be run.
-
-        Raises:
-            InputError: for an unknown label, or a row with only the paper's values.
-        """
+        """Return the given labels; without any, the labels of all variants that can be run. Raises InputError
+        for an unknown label, or a row with only the paper's values."""
         labels = [variant.label for variant in self.list_runnable()]
         if missing := [name for name in names if name not in labels]:
             raise InputError(

@@ -53,15 +53,8 @@ BASE = "base"  # the variant's label in a sweep without variants and grids
 
 
 def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: None) -> Sweep:
-    """Read a sweep file. Its stem names the sweep's folder.
-
-    Args:
-        path: the file.
-        prepare: called with the base before the other keys are checked, because they may name custom metrics.
-
-    Raises:
-        InputError: for invalid content; the message names the file and the key.
-    """
+    """Read a sweep file. Its stem names the sweep's folder. `prepare` is called with the base before the
+    other keys are checked, because they may name custom metrics. Raises InputError for invalid content."""
     name = path.stem
     if not name.isprintable() or not name.strip(". ") or len(name.encode()) > MAX_NAME_BYTES:
         raise InputError(
@@ -89,9 +82,7 @@ def parse_sweep(name: str, content: Any) -> Sweep:
     variants = _parse_variants(content.get("variants", {}), branch)
     grids, seeds = _parse_axes(content)
     if "axes" in content and not variants:
-        variants = [
-            Variant("" if grids else BASE, branch=branch)
-        ]  # no variants, and perhaps only a seed axis
+        variants = [Variant("" if grids else BASE, branch=branch)]
     variants = list(_repeat_in_cells(variants, _list_cells(grids))) if grids else variants
     runnable = [variant.label for variant in variants if variant.overrides is not None]
     if not runnable:
@@ -163,10 +154,8 @@ def _parse_variant(label: str, value: Any, branch: str) -> Variant:
 
 
 def _parse_axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple[int, ...]]:
-    """Return the grids of the axes that are not empty, and the sweep's seeds.
-
-    A single grid may have seeds as an axis.
-    """
+    """Return the grids of the axes that are not empty, and the sweep's seeds, which a single grid may have as
+    an axis."""
     axes = content.get("axes", {})
     several = isinstance(axes, list)
     if several and not axes:
@@ -197,11 +186,8 @@ def _list_cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str,
 
 
 def _repeat_in_cells(variants: Sequence[Variant], cells: Sequence[tuple[str, ...]]) -> Iterable[Variant]:
-    """Yield each variant in each cell of the grids.
-
-    A cell's overrides are appended to the variant's label. A variant's own control becomes the control in the
-    same cell. Rows with only the paper's values are not repeated.
-    """
+    """Yield each variant in each cell of the grids, with the cell's overrides in its label. A variant's own
+    control becomes the control in the same cell. Rows with only the paper's values are not repeated."""
     axes = {parse_key(text) for cell in cells for text in cell}
     for variant in variants:
         if variant.overrides is None:

@@ -53,7 +53,7 @@ def test_a_failing_output_is_reported_once_and_the_others_continue():
 
 def test_a_busy_network_drops_a_datagram_and_other_errors_are_raised():
     receiver = Receiver("127.0.0.1", 39539, "--vmc")
-    receiver.close()
+    receiver.socket.close()
     for state in (errno.EAGAIN, errno.ENOBUFS, errno.ENETUNREACH):
         receiver.socket = Mock(**{"sendto.side_effect": OSError(state, "as it is")})
         with pytest.raises(OSError, match="as it is") if state == errno.ENETUNREACH else nullcontext():
@@ -68,7 +68,7 @@ def test_a_name_with_both_addresses_is_reached_by_its_ipv4_address(monkeypatch: 
         monkeypatch.setattr(socket, "getaddrinfo", lambda *_, found=found, **__: found)
         receiver = Receiver("localhost", 39539, "--vmc")
         assert str(receiver) == expected
-        receiver.close()
+        receiver.socket.close()
 
 
 SECONDS, HEIGHT, FLOOR = 5, 1.86, 0.25

@@ -24,7 +24,7 @@ from memmlp.runs.lookup import change_run
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
-from memmlp.sweep.worker import Cancelled, Presence, has_controller, try_task, work_on_plan
+from memmlp.sweep.worker import Cancelled, has_controller, is_writer_alive, try_task, work_on_plan
 
 CODES = RunTask("c" * 16, "vqvae", {})
 ONE, TWO, ALONE = (
@@ -258,15 +258,15 @@ def test_a_controller_elsewhere_is_dead_once_it_has_not_been_seen_for_long(tmp_p
 def test_presence_ends_with_its_process(tmp_path: Path):
     path = tmp_path / "here.lock"
     code = (
-        "import sys, time; from pathlib import Path; from memmlp.sweep.worker import Presence\n"
-        "here = Presence(Path(sys.argv[1])); print('here', flush=True); time.sleep(600)"
+        "import sys, time; from pathlib import Path; from memmlp.sweep.worker import write_process_file\n"
+        "write_process_file(Path(sys.argv[1])); print('here', flush=True); time.sleep(600)"
     )
     with started([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        assert Presence.is_alive(path)
+        assert is_writer_alive(path)
         process.kill()
         process.wait()
-    assert not Presence.is_alive(path)
+    assert not is_writer_alive(path)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"entries": [{}], "tasks": [], "cancelled": []}'])

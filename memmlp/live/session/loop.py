@@ -104,22 +104,14 @@ def run_loop(
 
 
 def make_frame_message(stream: Stream, frame: BodyFrame, truth: np.ndarray | None) -> dict[str, Any]:
-    """Return the message about a stream's newest frame.
-
-    - `time`: the frame's time, seconds.
-    - `held`: the held trackers.
-    - `jumping`: whether the samples' times jump (`OddSamples`).
-    - `ms`: the computation time of the network, milliseconds.
-    - `positions`, `truth`: predicted and true joints, each 66 integers in millimetres and openxr axes.
-
-    The loop adds the frame number, the counts, and `whole`: the milliseconds from the sample's arrival until
-    all outputs have the pose.
-    """
+    """Return the message about a stream's newest frame. `positions` and `truth` are predicted and true joints
+    (22, 3), metres, AMASS' world. The loop adds the frame number, the counts, and `whole`: the milliseconds
+    from the sample's arrival until all outputs have the pose."""
     return {
-        "time": round(frame.time, 4),
-        "held": frame.held,
-        "jumping": stream.odd.jumping,
-        "ms": round(1000 * stream.step_seconds, 3),
+        "time": round(frame.time, 4),  # seconds
+        "held": frame.held,  # the held trackers
+        "jumping": stream.odd.jumping,  # whether the samples' times jump
+        "ms": round(1000 * stream.step_seconds, 3),  # the computation time of the network, milliseconds
         "positions": convert_to_millimetres(move_up(frame.positions, stream.wearer.floor)),
         "truth": convert_to_millimetres(truth),
     }
@@ -134,13 +126,9 @@ def convert_to_millimetres(joints: np.ndarray | None) -> list[int] | None:
 
 
 def make_avatar_message(frame: BodyFrame) -> dict[str, Any]:
-    """Return the message fields for an avatar.
-
-    - `turns`: joint rotations, 22 quaternions xyzw as 88 integers. They are relative to VRM's T-pose, which
-      is also SMPL's: Y up, facing +Z. The root rotation is in the page's axes.
-    - `hips`: the height of the hips in the rest pose, metres. It determines the avatar's size. The user can
-      change it on the page at any time.
-    """
+    """Return the message fields for an avatar: `turns`, joint rotations as 22 quaternions xyzw, 88 integers,
+    relative to VRM's T-pose, which is also SMPL's (Y up, facing +Z), with the root rotation in the page's
+    axes; and `hips`, the height of the hips in the rest pose, metres, which determines the avatar's size."""
     local = frame.local.copy()
     local[0] = PAGE_SPACE.world.T @ local[0]
     turns = (UNIT * matrix_to_quaternion(local)).round().astype(int).ravel().tolist()

@@ -227,7 +227,6 @@ class ClipSource:
         self.start: float | None = None
 
     def read(self) -> SourceSample | None:
-        """Wait for the next sample, and return it."""
         now = self.clock()
         self.start = now if self.start is None else self.start
         due = int((now - self.start) * self.hz + 1e-6)
@@ -246,12 +245,11 @@ class ClipSource:
         return (self.count - 1) / self.hz + PAUSE
 
     def get_true_joints(self, time: float) -> np.ndarray:
-        """Return the true joints (22, 3), metres, AMASS' world."""
         half = PAUSE / 2  # a time that is rounded to before the start of a repetition still belongs to it
         return self.clip.interpolate_joints((time + half) % self.round_seconds - half)
 
     def close(self) -> None:
-        """Do nothing. This source does not hold resources."""
+        pass
 
 
 class PacketSource:
@@ -312,8 +310,7 @@ class PacketSource:
         return SourceSample(now, packet.trackers, arrived, dropped)
 
     def get_true_joints(self, time: float) -> None:
-        """Return None, because the true joints are unknown."""
+        return None
 
     def close(self) -> None:
-        """Close the port."""
         self.socket.close()

@@ -122,6 +122,7 @@ def _parse_rate(path: Path, value: np.ndarray) -> float:
 
 def _read_array(path: Path, file: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
     """Read an array, after a check of its unpacked size."""
+    assert file.zip is not None  # it is open
     info = file.zip.getinfo(f"{key}.npy")
     if info.compress_type not in METHODS:
         raise InputError(

@@ -52,17 +52,9 @@ SMOOTHING = 0.2  # seconds over which the camera's path is smoothed
 def find_frame_range(
     length: int, title: str, begin: float, end: float | None, keys: tuple[str, str] = ("begin", "end")
 ) -> tuple[int, int]:
-    """Return the first frame of a piece of a clip, and the frame after its end.
-
-    Args:
-        length: the clip's number of frames.
-        title: the clip's name.
-        begin, end: start and end of the piece, seconds; None for the end of the clip.
-        keys: the names of begin and end in messages.
-
-    Raises:
-        InputError: if the piece contains no frame.
-    """
+    """Return the first frame of a piece of a clip with `length` frames, and the frame after its end. The
+    piece begins and ends at times in seconds; None is the end of the clip. `keys` are the names of begin and
+    end in messages. Raises InputError if the piece contains no frame."""
     stop = length / FPS if end is None else min(end, length / FPS)
     if not 0 <= begin < stop or round(begin * FPS) == round(stop * FPS):  # also true for NaN
         given = f"{keys[0]} {begin:g}" + ("" if end is None else f" {keys[1]} {end:g}")
@@ -78,14 +70,8 @@ def find_colour_scale_top(errors: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class ClipPiece:
-    """A piece of a clip with the true motion and predictions.
-
-    Attributes:
-        title: the clip's name.
-        truth: joint positions (N, 22, 3), metres, world (Z up), at 60 Hz.
-        predictions: predicted joint positions by label, in the layout of `truth`.
-        start: the index of the piece's first frame in the clip.
-    """
+    """A piece of a clip with true joint positions (N, 22, 3), metres, world (Z up), at 60 Hz, and predictions
+    of them by label. `title` is the clip's name, `start` the index of the piece's first frame in the clip."""
 
     title: str
     truth: np.ndarray
@@ -117,10 +103,8 @@ class ClipPiece:
         return float(np.clip(highest - BOTTOM, LOWEST, HIGHEST))
 
     def list_skeletons(self, frame: int) -> list[tuple[np.ndarray, np.ndarray | None]]:
-        """Return joints (22, 3) and errors (22,), as fractions of the scale's top, of each skeleton.
-
-        The truth comes first, with None as errors.
-        """
+        """Return joints (22, 3) and errors (22,), as fractions of the scale's top, of each skeleton. The
+        truth comes first, with None as errors."""
         predicted = [(p[frame], self.errors[k][frame] / self.top) for k, p in self.predictions.items()]
         return [(self.truth[frame], None), *predicted]
 
@@ -145,13 +129,8 @@ class ClipPiece:
 
 
 def check_picture_path(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUFFIXES) -> None:
-    """Raise InputError for an invalid picture file or a missing package.
-
-    Args:
-        path: the file to write.
-        key: the name of the option or argument in messages.
-        suffixes: the valid suffixes.
-    """
+    """Raise InputError, with the name of the option or argument, for an invalid picture file or a missing
+    package."""
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{key} {path}: must end in {', '.join(suffixes)}")
     if not path.parent.is_dir():
@@ -163,11 +142,8 @@ def check_picture_path(path: Path, key: str = "path", suffixes: tuple[str, ...] 
 
 
 def write_picture(path: Path, piece: ClipPiece, poses: int = POSES, key: str = "path") -> None:
-    """Write a PNG or SVG of `poses` poses, or a GIF or MP4 of all frames, completely or not at all.
-
-    Raises:
-        InputError: if the file can't be written, or PyAV is not installed for an MP4.
-    """
+    """Write a PNG or SVG of `poses` poses, or a GIF or MP4 of all frames, completely or not at all. Raises
+    InputError if the file can't be written, or PyAV is not installed for an MP4."""
     suffix = path.suffix.lower()
     try:
         if suffix == ".svg":
@@ -186,11 +162,9 @@ def select_frames(piece: ClipPiece, poses: int) -> list[int]:
 
 
 def draw_poses(piece: ClipPiece, poses: int = POSES) -> Figure:
-    """Draw a heat-map figure like the paper's Figs. 6 and 9 to 13.
-
-    The first row shows true poses. Each other row shows a prediction, coloured by error, with the mean error
-    of the 22 joints below. All rows show a pose from the same camera, in front of the person.
-    """
+    """Draw a heat-map figure like the paper's Figs. 6 and 9 to 13. The first row shows true poses. Each other
+    row shows a prediction, coloured by error, with the mean error of the 22 joints below. All rows show a
+    pose from the same camera, in front of the person."""
     labels = ["truth", *piece.predictions]
     figure, panels = make_panels(150 + 230 * poses, 60 + 360 * len(labels), len(labels), poses)
     frames = select_frames(piece, poses)
@@ -220,9 +194,8 @@ def encode_svg(piece: ClipPiece, poses: int = POSES) -> str:
             x = 40 + PANEL[0] * column
             parts.append(f'<svg x="{x}" y="{y}" width="{PANEL[0]}" height="{PANEL[1]}">')
             parts.append(write_skeleton(camera, joints, errors, piece.floor) + "</svg>")
-            note = f"{piece.find_seconds(frame):.2f} s"
-            if row:
-                note = f"{piece.errors[label][frame].mean():.1f} cm"
+            seconds = piece.find_seconds(frame)
+            note = f"{piece.errors[label][frame].mean():.1f} cm" if row else f"{seconds:.2f} s"
             parts.append(write_text(x + PANEL[0] / 2, y + PANEL[1] - 8, note, 13, anchor="middle"))
     parts.append(write_colour_scale(width - 150, 14, piece.top))
     size = f'width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
@@ -270,11 +243,8 @@ def _add_colour_scale(figure: Figure, piece: ClipPiece) -> Text:
 
 
 def encode_gif(pictures: Iterable[np.ndarray]) -> bytes:
-    """Encode pictures as a GIF that repeats endlessly.
-
-    All pictures share one palette, so the film does not flicker. It has shades of the heat map, of the
-    truth's colour and of grey.
-    """
+    """Encode pictures as a GIF that repeats endlessly. All pictures share one palette, so the film does not
+    flicker. It has shades of the heat map, of the truth's colour and of grey."""
     from PIL import Image
 
     heat, white = make_heat_colours()(np.linspace(0, 1, 28))[:, :3], np.ones((1, 3))

@@ -40,19 +40,12 @@ def make_heat_colours() -> Colormap:
 
 @dataclass(frozen=True)
 class Camera:
-    """A parallel projection of the world (Z up).
+    """A parallel projection of the world (Z up)."""
 
-    Attributes:
-        centre: the point (3,) in the middle of the picture, metres.
-        azimuth: rotation about the vertical axis, radians; at 0 the camera looks along +Y.
-        metres: the height of the visible area.
-        elevation: the angle by which the camera looks down, radians.
-    """
-
-    centre: np.ndarray
-    azimuth: float
-    metres: float
-    elevation: float = ELEVATION
+    centre: np.ndarray  # the point (3,) in the middle of the picture, metres
+    azimuth: float  # rotation about the vertical axis, radians; at 0 the camera looks along +Y
+    metres: float  # the height of the visible area
+    elevation: float = ELEVATION  # the angle by which the camera looks down, radians
 
     @property
     def axes(self) -> np.ndarray:
@@ -98,15 +91,9 @@ def encode_png(figure: Figure) -> bytes:
 def draw_skeleton(
     axes: Axes, camera: Camera, joints: np.ndarray, errors: np.ndarray | None = None, floor: float = 0.0
 ) -> None:
-    """Draw a skeleton in a panel, and remove the previous one.
-
-    Args:
-        axes: the panel; its coordinates become metres from the camera's centre, to the right and up.
-        camera: the projection.
-        joints: positions (22, 3), metres, world.
-        errors: errors of the joints (22,), as fractions of the colour scale's top; None for the truth.
-        floor: the floor's height, metres.
-    """
+    """Draw a skeleton with joints (22, 3), metres, world, in a panel, and remove the previous one. The
+    panel's coordinates become metres from the camera's centre, to the right and up. `errors` (22,) are
+    fractions of the colour scale's top; None for the truth. `floor` is the floor's height, metres."""
     for artist in list(axes.collections):
         artist.remove()
     box = axes.get_window_extent()
@@ -157,9 +144,7 @@ def _draw_floor(axes: Axes, camera: Camera, joints: np.ndarray, floor: float, ra
         LineCollection(list(places), colors=[(0, 0, 0, dark) for dark in fade], linewidths=0.8)
     )
     feet = np.concatenate([find_limb_ends(limb, joints) for limb in LIMBS])
-    spread = SHADOW + 0.25 * np.maximum(
-        np.nan_to_num(feet[:, 2:]) - floor, 0
-    )  # higher joints: wider, fainter
+    spread = SHADOW + 0.25 * np.maximum(np.nan_to_num(feet[:, 2:]) - floor, 0)  # wider for higher joints
     feet[:, 2] = floor
     sizes = 2 * spread * [1, np.sin(camera.elevation)]
     dark = [(0, 0, 0, 0.03 * (SHADOW / radius) ** 2) for (radius,) in spread]
@@ -167,14 +152,7 @@ def _draw_floor(axes: Axes, camera: Camera, joints: np.ndarray, floor: float, ra
 
 
 def _add_ellipses(axes: Axes, places: np.ndarray, sizes: np.ndarray, colours: Any) -> None:
-    """Add filled ellipses.
-
-    Args:
-        axes: the panel.
-        places: the centres (n, 2), metres.
-        sizes: widths and heights (n, 2), metres.
-        colours: n colours.
-    """
+    """Add filled ellipses with centres (n, 2) and widths and heights (n, 2), metres, and n colours."""
     from matplotlib.collections import EllipseCollection
 
     finite = np.isfinite(places).all(1)  # a diverged network predicts NaN
@@ -202,11 +180,9 @@ def write_skeleton(camera: Camera, joints: np.ndarray, errors: np.ndarray | None
     for limb in sorted(LIMBS, key=lambda one: camera.project(ends[one].mean(0))[2]):
         first, last = ends[limb]
         for begin, end in pairwise(middle):
-            share = (begin + end) / 2
-            colour = NEUTRAL_HEX
+            share, colour = (begin + end) / 2, NEUTRAL_HEX
             if errors is not None:
-                value = (1 - share) * errors[limb.first_joint] + share * errors[limb.end]
-                colour = mix_heat(float(value))
+                colour = mix_heat(float((1 - share) * errors[limb.first_joint] + share * errors[limb.end]))
             (x1, y1), (x2, y2) = (place(first + part * (last - first)) for part in (begin, end))
             radius = scale * (limb.radii[0] + share * (limb.radii[1] - limb.radii[0]))
             line = f'<path d="M{x1:.1f} {y1:.1f}L{x2:.1f} {y2:.1f}" stroke="{colour}"'
@@ -219,21 +195,16 @@ def mix_heat(value: float) -> str:
     stops = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in HEAT], float)
     at = float(np.clip(np.nan_to_num(value, nan=1.0), 0, 1)) * (len(HEAT) - 1)
     low = min(int(at), len(HEAT) - 2)
-    return "#" + "".join(
-        f"{round(part):02x}" for part in stops[low] + (at - low) * (stops[low + 1] - stops[low])
-    )
+    mixed = stops[low] + (at - low) * (stops[low + 1] - stops[low])
+    return "#" + "".join(f"{round(part):02x}" for part in mixed)
 
 
 def write_colour_scale(x: float, y: float, top: float) -> str:
     """Return a horizontal colour scale from 0 to `top` cm as SVG elements."""
-    cells = (
-        f'<rect x="{x + 4 * i}" y="{y}" width="4" height="10" fill="{mix_heat(i / 29)}"/>' for i in range(30)
-    )
-    return (
-        "".join(cells)
-        + write_text(x, y + 26, "0", 12)
-        + write_text(x + 120, y + 26, f"{top:g} cm", 12, anchor="end")
-    )
+    size = 'width="4" height="10"'
+    cells = [f'<rect x="{x + 4 * i}" y="{y}" {size} fill="{mix_heat(i / 29)}"/>' for i in range(30)]
+    limits = write_text(x, y + 26, "0", 12), write_text(x + 120, y + 26, f"{top:g} cm", 12, anchor="end")
+    return "".join((*cells, *limits))
 
 
 def write_text(

@@ -32,15 +32,9 @@ SIDE = np.deg2rad(35)  # the camera's angle from the person's front, radians
 def read_sample(
     source: Path, count: int, body: str = "builtin"
 ) -> tuple[list[tuple[str, np.ndarray]], list[SkippedFile], int]:
-    """Read an npz file, or `count` files from a folder, evenly spaced in the order of their names.
-
-    Returns:
-        Name and global joint positions (N, 22, 3), metres, world, of each clip; the skipped files; and the
-        number of all files.
-
-    Raises:
-        InputError: if the folder has no npz files, or no file could be read.
-    """
+    """Read an npz file, or `count` files from a folder, evenly spaced in the order of their names. Return
+    name and global joint positions (N, 22, 3), metres, world, of each clip; the skipped files; and the number
+    of all files. Raises InputError if the folder has no npz files, or no file could be read."""
     rest = load_rest_joints(body)
     files = find_clips(source).files if source.is_dir() else [source.name]
     top = source if source.is_dir() else source.parent
@@ -60,11 +54,8 @@ def read_sample(
 
 
 def draw_sheet(clips: Sequence[tuple[str, np.ndarray]]) -> Figure:
-    """Draw clips side by side, each with three evenly spaced poses.
-
-    Args:
-        clips: pairs of name and global joint positions (N, 22, 3), metres, world (Z up, floor at 0).
-    """
+    """Draw clips side by side, each with three evenly spaced poses, given names and global joint positions
+    (N, 22, 3), metres, world (Z up, floor at 0)."""
     rows = -(-len(clips) // ACROSS)
     figure, panels = make_panels(150 * ACROSS * MOMENTS, 246 * rows, rows, ACROSS * MOMENTS)
     shown = list(zip(panels.reshape(-1, MOMENTS), clips, strict=False))
@@ -88,10 +79,8 @@ LEFT, RIGHT, MIDDLE, UNMAPPED = "#1f6fd0", "#d0561f", "#2a8c4a", "#b4bac1"
 
 
 def write_skeleton_picture(path: Path, stance: StanceView, title: str) -> None:
-    """Write a PNG with front and right views of the file's nodes and of the body in the same stance.
-
-    Mapped nodes are coloured and numbered, and a list shows their names. Other nodes are grey.
-    """
+    """Write a PNG with front and right views of the file's nodes and of the body in the same stance. Mapped
+    nodes are coloured and numbered, and a list shows their names. Other nodes are grey."""
     figure, panels = make_panels(1700, 440, 1, 5)
     figure.suptitle(f"{title}, read from {stance.source}", x=0.01, ha="left", weight="bold")
     labels = ("", "the file, from the front", "from the right", "the body in this stance", "from the right")
@@ -100,9 +89,8 @@ def write_skeleton_picture(path: Path, stance: StanceView, title: str) -> None:
     freeze_layout(figure)
     names, front, side, body_front, body_side = panels[0]
     nodes = strip_namespace(stance.nodes)
-    for row, (joint, node) in enumerate(
-        sorted(stance.mapped.items(), key=lambda one: find_joint_colour(one[0]))
-    ):
+    for row, joint in enumerate(sorted(stance.mapped, key=find_joint_colour)):
+        node = stance.mapped[joint]
         text = f"{node}  {joint} = {nodes[node]}"
         names.text(0, 0.96 - row / 23, text, color=find_joint_colour(joint), size=9)
     _draw_nodes(front, stance, 0)
@@ -121,10 +109,8 @@ def find_joint_colour(joint: str) -> str:
 
 
 def _draw_nodes(panel: Axes, stance: StanceView, axis: int) -> None:
-    """Draw all nodes with lines to their parents. The given coordinate axis points right.
-
-    The panel shows the area around the mapped nodes, because a root node may be far from the person.
-    """
+    """Draw all nodes with lines to their parents. The given coordinate axis points right. The panel shows the
+    area around the mapped nodes, because a root node may be far from the person."""
     mapped = stance.positions[list(stance.mapped.values())]
     places = (stance.positions - (mapped.min(0) + mapped.max(0)) / 2)[:, [axis, 1]]
     for node, parent in enumerate(stance.parents):

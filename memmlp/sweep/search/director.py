@@ -1,8 +1,6 @@
-"""The director of a search: it asks the study for trials, plans their runs, and records their results.
-
-A trial has a run for each seed. The first seed's run decides whether the trial is pruned. The other seeds'
-runs start after it.
-"""
+"""The director of a search: it asks the study for trials, plans their runs, and records their results. A
+trial has a run for each seed. The first seed's run decides whether the trial is pruned. The other seeds' runs
+start after it."""
 
 import os
 import time
@@ -15,7 +13,6 @@ from optuna.trial import Trial, TrialState
 from memmlp.common.errors import InputError
 from memmlp.common.lease import check_owner
 from memmlp.runs.identity import select_inference_config
-from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
 from memmlp.sweep.controller import READ_INTERVAL, Fleet
 from memmlp.sweep.plan import Entry, Plan, RunTask, order_tasks
@@ -27,21 +24,14 @@ MAX_FAILURES = 5  # the search ends if its first MAX_FAILURES trials all fail
 DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials that no longer need their runs
 
 Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[RunTask]]]
-"""Makes a list of tasks for each seed from a trial's values. A list ends with the seed's own run.
-
-Raises InputError if the config rejects the values.
-"""
+"""Makes a list of tasks for each seed from a trial's values. A list ends with the seed's own run. Raises
+InputError if the config rejects the values."""
 
 
 @dataclass
 class RunningTrial:
-    """A running trial and its tasks.
-
-    Attributes:
-        trial: the trial.
-        seeds: the tasks of each seed; the last task of a seed is the seed's own run.
-        seed_count: the number of seeds with requested runs.
-    """
+    """A running trial, the tasks of each seed, of which the last is the seed's own run, and the number of
+    seeds with requested runs."""
 
     trial: Trial
     seeds: Sequence[Sequence[RunTask]]
@@ -65,14 +55,9 @@ class RunningTrial:
 
 
 class Director:
-    """Starts and ends the trials of a search, and plans their runs.
-
-    Args:
-        study: the study, which owns the trials.
-        compose: makes the tasks of a trial.
-        plan: an empty, open plan, which gives its name and outputs folder to the plans of `update`.
-        check: called before each new trial; it raises InputError to end the search.
-    """
+    """Starts and ends the trials of a study, and plans their runs. `compose` makes the tasks of a trial.
+    `plan` is an empty, open plan, which gives its name and outputs folder to the plans of `update`. `check`
+    is called before each new trial, and raises InputError to end the search."""
 
     def __init__(self, study: Study, compose: Compose, plan: Plan, check: Callable[[], None] = lambda: None):
         self.study, self.compose, self.plan, self.check = study, compose, plan, check
@@ -82,11 +67,8 @@ class Director:
 
     def update(self, capacity: int) -> Plan:
         """Record finished trials, start new trials until `capacity` workers have a run, and return the plan.
-
-        Raises:
-            InputError: if at least MAX_FAILURES trials have ended and all of them failed, or if `check`
-                refuses a new trial.
-        """
+        Raises InputError if at least MAX_FAILURES trials have ended and all of them failed, or if `check`
+        refuses a new trial."""
         for number in list(self.running):
             if self._end_if_finished(self.running[number]):
                 del self.running[number]
@@ -111,10 +93,8 @@ class Director:
         self.running[trial.number] = started
 
     def _end_if_finished(self, one: RunningTrial) -> bool:
-        """Record the trial in the study if it has ended, and return whether it has.
-
-        When the first seed's run is done, the runs of the other seeds are requested.
-        """
+        """Record the trial in the study if it has ended, and return whether it has. When the first seed's run
+        is done, the runs of the other seeds are requested."""
         last = [tasks[-1] for tasks in one.seeds]
         runs = [self.plan.get_run(task) for task in last]
         if damage := [line for task in one.tasks for line in self.plan.get_run(task).damage]:
@@ -130,9 +110,8 @@ class Director:
         if self.plan.is_complete(last[0]):
             one.request_seeds(len(runs))
         if all(map(self.plan.is_complete, last)):
-            self.study.complete(
-                one.trial, [read_objectives(self.study.search.objectives, run) for run in runs]
-            )
+            objectives = self.study.search.objectives
+            self.study.complete(one.trial, [read_objectives(objectives, run) for run in runs])
             return True
         for task in one.tasks:
             if failure := self.plan.get_run(task).fault:
@@ -141,27 +120,21 @@ class Director:
         return one.seed_count == 1 and 0 < step < runs[0].total_steps and self.study.prune(one.trial)
 
     def _count_usable_workers(self) -> int:
-        """Return the number of workers that the running trials can use: one for each unfinished run.
-
-        A trial counts as at least one until it has been recorded as ended.
-        """
+        """Return the number of workers that the running trials can use: one for each unfinished run, and at
+        least one for a trial until it has been recorded as ended."""
         outputs = self.plan.outputs
-        return sum(
-            max(1, sum(not Run.from_id(outputs, name).done for name in one.runs))
-            for one in self.running.values()
-        )
+        left = ([not Run.from_id(outputs, name).done for name in one.runs] for one in self.running.values())
+        return sum(max(1, sum(unfinished)) for unfinished in left)
 
     def _report_validations(self, trial: Trial, run: Run) -> int:
-        """Report the run's new validations to the study, if the search has a single objective.
-
-        Returns:
-            The step of the last new validation, or 0.
-        """
+        """Report the run's new validations to the study, if the search has a single objective. Return the
+        step of the last new validation, or 0."""
         (objective, *others) = self.study.search.objectives
         if others:
             return 0
         known = trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values
-        new = {e.step: objective.value(e.values) for e in read_validations(run) if e.step not in known}
+        validations = (entry for entry in run.metrics() if entry.phase == "val")
+        new = {e.step: objective.value(e.values) for e in validations if e.step not in known}
         for step, value in new.items():
             trial.report(value, step)
         return max(new, default=0)
@@ -182,17 +155,9 @@ class Director:
         )
 
 
-def read_validations(run: Run) -> list[LogRecord]:
-    """Return the entries on the validation split in a run's log."""
-    return [entry for entry in run.metrics() if entry.phase == "val"]
-
-
 def read_objectives(objectives: Sequence[Objective], run: Run) -> list[float]:
-    """Return the value of each objective for a finished run's weights (`Run.kept_validation`).
-
-    Raises:
-        InputError: if the log was damaged and does not contain that validation.
-    """
+    """Return the value of each objective for a finished run's weights (`Run.kept_validation`). Raises
+    InputError if the log was damaged and does not contain that validation."""
     kept, step = run.kept_validation, run.manifest.get("best_step") or run.total_steps
     if kept is None or kept.step != step:
         raise InputError(f"{run.metrics_path}: the validation at step {step} is missing; run it again")
@@ -200,11 +165,8 @@ def read_objectives(objectives: Sequence[Objective], run: Run) -> list[float]:
 
 
 def run_search(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:
-    """Run the search: keep the fleet working until the study has all of its trials.
-
-    The plan is written to `path`, which the workers read. The file is touched repeatedly to show that the
-    director is alive.
-    """
+    """Keep the fleet working until the study has all of its trials. The plan is written to `path`, which the
+    workers read. The file is touched repeatedly to show that the director is alive."""
     plan = None
     try:
         with board:

@@ -19,11 +19,7 @@ ENDS = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState
 
 
 class SearchBoard(Screen):
-    """Shows a search in progress.
-
-    Args:
-        outputs: the folder of runs and caches.
-    """
+    """Shows a search in progress; `outputs` is the folder of runs and caches."""
 
     def __init__(self, outputs: Path):
         super().__init__()
@@ -31,7 +27,6 @@ class SearchBoard(Screen):
         self.printed: set[int] | None = None
 
     def update(self, study: Study) -> None:
-        """Show the current state of the study and its trials' runs."""
         ended = [trial for trial in study.trials if trial.state in ENDS]
         numbers = {trial.number for trial in ended}
         printed = numbers if self.printed is None else self.printed

@@ -10,7 +10,6 @@ from typing import Any
 import optuna
 import yaml
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
-from optuna.exceptions import ExperimentalWarning
 from optuna.importance import PedAnovaImportanceEvaluator
 from optuna.trial import FrozenTrial, TrialState
 
@@ -22,19 +21,15 @@ from memmlp.sweep.search.study import Study, compute_deviations, get_reason, get
 
 IMPORTANCE = "keys in which the best tenth of the trials differs from the others"
 ENOUGH_TRIALS = 25
-"""The minimum number of complete trials for an estimate of importance.
-
-In random searches over three keys, only one of them with an effect, that key was ranked first in 95 % of
-searches with 25 trials, in 78 % with 20 trials and in 45 % with 10 trials.
-"""
+"""The minimum number of complete trials for an estimate of importance. In random searches over three keys,
+only one of them with an effect, that key was ranked first in 95 % of searches with 25 trials, in 78 % with 20
+trials and in 45 % with 10 trials."""
 
 
 def write_trials(study: Study, path: Path) -> None:
     """Write all trials to a CSV file: number, state, objectives, values, runs, and the reason of a failure.
-
     With several seeds, the objectives are means. Columns with the standard deviations and each seed's values
-    follow. A pruned trial has empty objectives; the reason contains its last value.
-    """
+    follow. A pruned trial has empty objectives; the reason contains its last value."""
     search = study.search
     names, keys = [one.text for one in search.objectives], [one.key for one in search.space]
     seeds = range(1, search.seeds + 1) if search.seeds > 1 else ()
@@ -54,18 +49,9 @@ def write_trials(study: Study, path: Path) -> None:
 
 
 def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
-    """Write the best trial to experiment/best.yaml, and the rest of a Pareto front to trial-N.yaml.
-
-    Files of trials that are no longer on the front are removed.
-
-    Args:
-        study: the study.
-        folder: the search's folder.
-        groups: the names of the config groups; a trial chooses options of them.
-
-    Returns:
-        The paths of the files, with the best trial's file first.
-    """
+    """Write the best trial to FOLDER/experiment/best.yaml, and the rest of a Pareto front to trial-N.yaml,
+    and return the paths. Files of trials that are no longer on the front are removed. `groups` are the config
+    groups, of which a trial may choose options."""
     folder = folder / "experiment"
     folder.mkdir(parents=True, exist_ok=True)
     best = study.list_best()
@@ -78,11 +64,8 @@ def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> li
 
 
 def format_experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
-    """Return a trial as the text of a file for the config group `experiment`.
-
-    The text omits an `experiment=` override of the search's base, because an experiment cannot select another
-    experiment.
-    """
+    """Return a trial as the text of a file for the config group `experiment`. It omits an `experiment=`
+    override of the search's base, because an experiment cannot select another experiment."""
     search = study.search
     tree: dict[str, Any] = {}
     options: list[dict[str, str]] = []
@@ -108,28 +91,23 @@ def format_experiment(study: Study, trial: FrozenTrial, groups: Collection[str])
 
 def compute_importances(study: optuna.Study) -> list[tuple[str, float]]:
     """Return each key's importance for an Optuna study's first objective, largest first. The sum is 1.
-
     PED-ANOVA (Watanabe et al. 2023) measures in which keys the best tenth of the trials differs from all
     trials. It does not measure explained variance. The list is empty with fewer than ENOUGH_TRIALS complete
-    trials or with a single key.
-    """
+    trials or with a single key."""
     complete = _list_complete_trials(study)
     if len(complete) < ENOUGH_TRIALS or len(complete[0].params) < 2:
         return []
-    target = None if len(study.directions) == 1 else _get_first_objective
+    target = None if len(study.directions) == 1 else (lambda trial: trial.values[0])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        importances = optuna.importance.get_param_importances(
-            study, evaluator=_make_evaluator(), target=target
-        )
+        evaluator = PedAnovaImportanceEvaluator()  # Optuna's other evaluators need scikit-learn
+        importances = optuna.importance.get_param_importances(study, evaluator=evaluator, target=target)
     return sorted(importances.items(), key=lambda item: -item[1])
 
 
 def explain_missing_importances(study: optuna.Study) -> str | None:
-    """Return a line if a study has too few trials for importances.
-
-    Return None if it has enough trials, no complete trial, or a single key.
-    """
+    """Return a line if a study has too few trials for importances; None if it has enough trials, no complete
+    trial, or a single key."""
     complete = _list_complete_trials(study)
     if not 0 < len(complete) < ENOUGH_TRIALS or len(complete[0].params) < 2:
         return None
@@ -140,33 +118,17 @@ def _list_complete_trials(study: optuna.Study) -> list[FrozenTrial]:
     return [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.COMPLETE]
 
 
-def _make_evaluator() -> PedAnovaImportanceEvaluator:
-    with warnings.catch_warnings():  # Optuna's other evaluators need scikit-learn
-        warnings.simplefilter("ignore", ExperimentalWarning)
-        return PedAnovaImportanceEvaluator()
-
-
-def _get_first_objective(trial: FrozenTrial) -> float:
-    return trial.values[0]
-
-
 def find_boundary_warnings(study: optuna.Study) -> list[str]:
-    """Return a warning for each key with its best value at an end of the searched range.
-
-    The end is the outer 2 % of the range, on a logarithmic scale if the search uses one. There are no
-    warnings for several objectives, because a Pareto front often reaches the ends, or for a value of zero.
-    """
+    """Return a warning for each key with its best value at an end of the searched range: the outer 2 % of the
+    range, on a logarithmic scale if the search uses one. There are no warnings for several objectives,
+    because a Pareto front often reaches the ends, or for a value of zero."""
     if len(_list_complete_trials(study)) < 2 or len(study.directions) > 1:
         return []
-    best = study.best_trial
-    ends = (
-        (key, best.params[key], _find_range_end(best.params[key], one))
-        for key, one in best.distributions.items()
-    )
+    params, distributions = study.best_trial.params, study.best_trial.distributions
     return [
-        f"{key}: the best value, {value:g}, is the {end} tried value; consider a wider range"
-        for key, value, end in ends
-        if end
+        f"{key}: the best value, {params[key]:g}, is the {end} tried value; consider a wider range"
+        for key, distribution in distributions.items()
+        if (end := _find_range_end(params[key], distribution))
     ]
 
 

@@ -48,16 +48,10 @@ Value = float | int | str | bool | None
 
 @dataclass(frozen=True)
 class Range:
-    """The values that a search may give to one config key.
-
-    Attributes:
-        key: the dotted key.
-        low, high: the limits, inclusive; if both are whole numbers, only whole numbers are tried.
-        log: whether the logarithm of the values is sampled uniformly.
-        step: the step of a grid that starts at `low`; None without a grid.
-        choices: the possible values, instead of low and high; empty for a range.
-        first: the value in the first trial; None if the sampler chooses it.
-    """
+    """The values that a search may give to one config key: one of `choices`, or between `low` and `high`,
+    inclusive. If both are whole numbers, only whole numbers are tried. With `log`, the logarithm of the
+    values is sampled uniformly. `step` is that of a grid that starts at `low`. The sampler chooses the value
+    in the first trial if `first` is None."""
 
     key: str
     low: float | int = 0
@@ -68,7 +62,6 @@ class Range:
     first: Value | None = None
 
     def allows(self, value: Any) -> bool:
-        """Return whether a value is within the range, or is one of the choices."""
         if self.choices:
             return value in self.choices
         return isinstance(value, int | float) and self.low <= value <= self.high
@@ -80,12 +73,8 @@ class Range:
 
 @dataclass(frozen=True)
 class Objective:
-    """A weighted sum of validation metrics, which the search minimises.
-
-    Attributes:
-        text: the objective's text in the search file.
-        terms: pairs of a weight and a metric's name in the metrics log ("rotation MPJPE").
-    """
+    """A weighted sum of validation metrics, which the search minimises: its text in the search file, and
+    pairs of a weight and a metric's name in the metrics log ("rotation MPJPE")."""
 
     text: str
     terms: tuple[tuple[float, str], ...]
@@ -119,10 +108,8 @@ class Search:
     storage: str | None
 
     def list_first_trials(self) -> list[dict[str, Value]]:
-        """Return the prescribed trials' values by key; the sampler chooses the values of all other trials.
-
-        These are a trial with the values in `first`, or all combinations of a grid.
-        """
+        """Return the values by key of the trials that are not the sampler's: a trial with the values in
+        `first`, or all combinations of a grid."""
         if self.sampler == "grid":
             keys = [one.key for one in self.space]
             every = itertools.product(*(one.choices for one in self.space))
@@ -181,12 +168,8 @@ RULES = {
 
 
 def parse_search(content: Mapping[str, Any], best: Mapping[str, Value] | None = None) -> Search:
-    """Return the search that a config describes. Raises InputError for invalid content.
-
-    Args:
-        content: the config group `search`.
-        best: the values of an earlier search's best trial, by key.
-    """
+    """Return the search that the config group `search` describes; `best` has the values of an earlier
+    search's best trial, by key. Raises InputError for invalid content."""
     keys = [one.name for one in fields(Search)]
     for key in content:
         if key not in keys:
@@ -339,10 +322,7 @@ def _parse_number(value: Any, name: str) -> float | int:
 
 def read_best_trial(folder: Path) -> tuple[tuple[str, ...], dict[str, Value]]:
     """Return the overrides of all trials of a finished search, and the values of its best trial by key.
-
-    Raises:
-        InputError: if the folder has no finished search, a damaged one, or one without a complete trial.
-    """
+    Raises InputError if the folder has no finished search, a damaged one, or one without a complete trial."""
     record, path = folder / "search.json", folder / "trials.csv"
     if damage := records.find_damage(record, SearchRecord):
         raise InputError(damage)

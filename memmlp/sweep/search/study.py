@@ -40,15 +40,8 @@ class Study:
 
     @classmethod
     def open(cls, search: Search, name: str, folder: Path) -> Study:
-        """Open or create the study with this name. The calling process becomes its only owner.
-
-        Args:
-            search: the search.
-            name: the study's name in the storage.
-            folder: the folder of the journal, which is used if the search has no storage URL.
-
-        Raises:
-            InputError: if the storage cannot be opened.
+        """Open or create the study with this name. The calling process becomes its only owner. Without a
+        storage URL, the study is a journal in the folder. Raises InputError if the storage cannot be opened.
         """
         if search.storage is None:
             repair_journal(journal_path(folder))
@@ -88,10 +81,8 @@ class Study:
         return [trial for trial in trials if trial.state != TrialState.WAITING]
 
     def list_running(self) -> Iterator[Trial]:
-        """Yield the running trials. Missing values are suggested first.
-
-        Values are missing if the last owner was killed while it suggested them.
-        """
+        """Yield the running trials. Values that are missing, because the last owner was killed while it
+        suggested them, are suggested first."""
         for trial in self.trials:
             if trial.state == TrialState.RUNNING:
                 self.study.sampler = make_sampler(self.search, trial.number)
@@ -121,25 +112,18 @@ class Study:
         return True
 
     def complete(self, trial: Trial, values: Sequence[Sequence[float]]) -> None:
-        """End the trial with each objective's mean over seeds. The trial fails if a mean is NaN.
-
-        Args:
-            trial: the trial.
-            values: each seed's objectives.
-        """
+        """End the trial with each objective's mean over seeds, given each seed's objectives. The trial fails
+        if a mean is NaN."""
         trial.set_user_attr("values", [list(seed) for seed in values])
         means = [fmean(objective) for objective in zip(*values, strict=True)]
-        names = [
-            one.text for one, mean in zip(self.search.objectives, means, strict=True) if math.isnan(mean)
-        ]
-        if names:
+        named = zip(self.search.objectives, means, strict=True)
+        if names := [objective.text for objective, mean in named if math.isnan(mean)]:
             trial.set_user_attr("reason", f"{' and '.join(names)} is NaN")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self.study.tell(trial.number, means, skip_if_finished=True)
 
     def fail(self, trial: Trial, reason: str) -> None:
-        """End the trial as failed."""
         trial.set_user_attr("reason", reason)
         self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
@@ -163,20 +147,15 @@ class FencedJournal(JournalFileBackend):
         """Append lines to the journal. Raises LeaseLost if another process now owns its folder."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
         with naming_file(Path(self.path)), open(self.path, "ab") as file:
-            check_owner(
-                self.path
-            )  # after opening, because `repair_journal` of a later owner replaces the file
+            check_owner(self.path)  # after opening, because `repair_journal` of a later owner replaces it
             file.write(lines.encode())
             file.flush()
             os.fsync(file.fileno())
 
 
 def open_storage(url: str | None, folder: Path) -> BaseStorage:
-    """Open the storage at a URL, or the journal in a folder if the URL is None.
-
-    Raises:
-        InputError: for an invalid URL or a damaged journal.
-    """
+    """Open the storage at a URL, or the journal in a folder if the URL is None. Raises InputError for an
+    invalid URL or a damaged journal."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     if url:
         try:
@@ -200,11 +179,9 @@ def journal_path(folder: Path) -> Path:
 
 
 def repair_journal(path: Path) -> None:
-    """Replace a journal by a copy without an incomplete last line. Only the owner may call this.
-
-    A killed process may leave an incomplete line, and Optuna cannot read lines after it. An earlier owner
-    that resumes after a freeze appends to the replaced file, so it does not change the copy.
-    """
+    """Replace a journal by a copy without an incomplete last line, which a killed process may leave; Optuna
+    cannot read lines after it. Only the owner may call this. An earlier owner that resumes after a freeze
+    appends to the replaced file, so it does not change the copy."""
     check_journal(path)
     if path.exists():
         content = path.read_bytes()
@@ -226,9 +203,7 @@ def _make_damage_error(path: Path, reason: object) -> InputError:
 
 def make_sampler(search: Search, number: int, key: int = 0) -> optuna.samplers.BaseSampler:
     """Return the sampler of a trial, or of one of its keys, seeded with the search's seed and both numbers.
-
-    So random values are the same if the search is killed at any moment and resumed, even within a trial.
-    """
+    So random values are the same if the search is killed at any moment and resumed, even within a trial."""
     seed = int(np.random.SeedSequence([search.seed, number, key]).generate_state(1)[0])
     if search.startup is None or search.sampler != "tpe":  # the trials of a grid already have values
         return optuna.samplers.RandomSampler(seed=seed)
