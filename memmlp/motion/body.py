@@ -24,6 +24,7 @@ JOINTS = (
 )  # fmt: skip
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
 N_JOINTS = len(JOINTS)
+CHILDREN = tuple([child for child, parent in enumerate(PARENTS) if parent == j] for j in range(N_JOINTS))
 
 ROOT, HEAD, LEFT_WRIST, RIGHT_WRIST = 0, 15, 20, 21
 TRACKED = (HEAD, LEFT_WRIST, RIGHT_WRIST)  # the three sensors, in the order of the input
@@ -108,8 +109,7 @@ SWAPPED = tuple(JOINTS.index("_".join(_SIDES.get(word, word) for word in name.sp
 
 # Imported clips can be used only with the body of their import: their height above the floor depends on it
 
-RECORD = "import.json"
-"""Name of the record file that an import writes into its folder."""
+RECORD = "import.json"  # the record file that an import writes into its folder
 
 
 def describe_body(body: str, rest: np.ndarray) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,11 +15,9 @@ INTERPOLATED = "interpolated"
 PIECE = 3600  # maximum number of frames that are processed at a time
 SPLINES, LINES = "splines", "lines"
 INTERPOLATIONS = (SPLINES, LINES)
-"""The methods of interpolation between two recorded frames.
-
-Splines are as smooth as human motion. Lines have a kink at each recorded frame. For Bandai-Namco's motion at
-30 Hz, that makes the jerk four times as large (docs/guides/checks.md).
-"""
+"""The methods of interpolation between two recorded frames. Splines are as smooth as human motion. Lines have
+a kink at each recorded frame. For Bandai-Namco's motion at 30 Hz, that makes the jerk four times as large
+(docs/guides/checks.md)."""
 RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame time of .0083333) is 120
 
 
@@ -31,21 +29,19 @@ class SkippedFile:
     reason: str
 
 
+def describe_first(skipped: Sequence[SkippedFile]) -> str:
+    """Return the first of several skipped files as the end of a message; empty without one."""
+    return f"; the first: {skipped[0].file}: {skipped[0].reason}" if skipped else ""
+
+
 @dataclass(frozen=True)
 class Clip:
-    """Motion of the 22 body joints.
+    """Motion of the 22 body joints."""
 
-    Attributes:
-        name: path below the data root, `/`-separated, without suffix.
-        poses: axis-angle (N, 22, 3), radians: local rotations; the root's rotation is global.
-        trans: translation (N, 3), metres, world (Z up); the root joint is at rest[0] + trans.
-        fps: frames per second.
-    """
-
-    name: str
-    poses: np.ndarray
-    trans: np.ndarray
-    fps: float
+    name: str  # path below the data root, `/`-separated, without suffix
+    poses: np.ndarray  # axis-angle (N, 22, 3), radians: local rotations; the root's rotation is global
+    trans: np.ndarray  # translation (N, 3), metres, world (Z up); the root joint is at rest[0] + trans
+    fps: float  # frames per second
 
     def __len__(self) -> int:
         return len(self.poses)

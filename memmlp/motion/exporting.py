@@ -12,7 +12,7 @@ import numpy as np
 from memmlp.common.errors import InputError, escape_line_breaks
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import check_imported_body, load_rest_joints
-from memmlp.motion.clip import Clip, SkippedFile, resample
+from memmlp.motion.clip import Clip, SkippedFile, describe_first, resample
 from memmlp.motion.formats.bvh import write_bvh
 from memmlp.motion.formats.gltf import write_gltf
 from memmlp.motion.formats.npz import NoMotionError, read_clip, write_clip
@@ -189,6 +189,6 @@ def convert_and_export(
             written.append(target.path)
             seconds += len(clip) / clip.fps
     if not written:
-        first = f"; the first: {skipped[0].file}: {skipped[0].reason}" if skipped else ""
-        raise InputError(f"no usable clip in {len(plan.targets)} files{first}; expected AMASS npz files")
+        found = f"no usable clip in {len(plan.targets)} files{describe_first(skipped)}"
+        raise InputError(f"{found}; expected AMASS npz files")
     return ExportReport(tuple(written), seconds, tuple(skipped), faults)

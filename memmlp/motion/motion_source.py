@@ -38,7 +38,7 @@ class PreparedMotion(NamedTuple):
         return self.manifest.digest
 
     def has(self, part: str) -> bool:
-        """Return whether a part has clips; without validation clips, trainings are not validated."""
+        """Return whether a part has clips."""
         return bool(self.manifest.part(part))
 
     def open(self, part: str) -> MotionDataset:
@@ -59,12 +59,8 @@ class PreparedMotion(NamedTuple):
 
 @dataclass(frozen=True)
 class ShippedMotion:
-    """One clip as the test clips of a shipped network, for use without the network's data.
-
-    Attributes:
-        clip: an AMASS npz file.
-        rest: rest joints (22, 3) of the network's body, metres.
-    """
+    """One AMASS npz file as the test clips of a shipped network, with the rest joints (22, 3) of its body,
+    metres, for use without the network's data."""
 
     clip: Path
     rest: np.ndarray

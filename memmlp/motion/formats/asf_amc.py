@@ -8,19 +8,16 @@ In the file they are inches times the factor `length` of `:units`. Y is up.
 
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.formats.recording import END, Recording
+from memmlp.motion.formats.recording import END, LIMIT, Recording, fail, open_text
 
 INCH = 0.0254  # metres
-LIMIT = 1e6  # maximum absolute value of all numbers in the files
-MAX_BYTES = 2**28
 ROOT = "root"
 ROTATIONS, POSITIONS = ("rx", "ry", "rz"), ("tx", "ty", "tz")
 
@@ -70,18 +67,8 @@ class AsfAmc(Recording):
             rotations[node] = above @ local
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
-    def compute_pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        values: list[float] = []
-        for name, bone in zip(self.nodes, self.bones, strict=False):
-            count = sum(dof in ROTATIONS for dof in bone.dofs)
-            angles = list(turns.get(name, [0.0] * count))
-            if len(angles) != count:
-                raise InputError(
-                    f"{self.path}: rest.{name} has {len(angles)} values; must have {count}, one per angle"
-                )
-            values += [angles.pop(0) if dof in ROTATIONS else 0.0 for dof in bone.dofs]
-        rotations, positions = replace(self, values=np.array([values])).compute_kinematics()
-        return rotations[0], positions[0]
+    def list_rest_values(self) -> list[list[float | None]]:
+        return [[None if dof in ROTATIONS else 0.0 for dof in bone.dofs] for bone in self.bones]
 
 
 # Reading
@@ -115,29 +102,17 @@ def find_asf(path: Path) -> Path:
     files = [file for file in path.parent.glob("*") if file.suffix.lower() == ".asf"]
     matches = [file for file in files if path.stem.lower().startswith(f"{file.stem}_".lower())]
     if not matches:
-        raise InputError(
-            f"{path}: no skeleton in the same folder; expected {path.stem.partition('_')[0]}.asf"
-        )
+        expected = f"{path.stem.partition('_')[0]}.asf"
+        raise InputError(f"{path}: no skeleton in the same folder; expected {expected}")
     return max(matches, key=lambda file: len(file.stem))
-
-
-def _fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
-    raise InputError(f"{path}: line {line}: {wrong}; expected {expected}")
 
 
 def _read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield line number and words of each line, without comments and blank lines."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: too large; must be at most {MAX_BYTES >> 20} MiB")
-        with open(path, encoding="latin-1") as file:  # comments may have any encoding
-            for number, line in enumerate(file, start=1):
-                if words := line.partition("#")[0].split():
-                    yield number, words
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); expected an {path.suffix} file"
-        ) from error
+    with open_text(path, "latin-1") as file:  # comments may have any encoding
+        for number, line in enumerate(file, start=1):
+            if words := line.partition("#")[0].split():
+                yield number, words
 
 
 def _parse_numbers(path: Path, line: int, words: Sequence[str], count: int, key: str) -> list[float]:
@@ -146,12 +121,8 @@ def _parse_numbers(path: Path, line: int, words: Sequence[str], count: int, key:
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(abs(number) <= LIMIT for number in numbers):
-        _fail(
-            path,
-            line,
-            f"{key} {' '.join(words)[:60]}",
-            f"{count} numbers of at most {LIMIT:g} in absolute value",
-        )
+        expected = f"{count} numbers of at most {LIMIT:g} in absolute value"
+        fail(path, line, f"{key} {' '.join(words)[:60]}", expected)
     return numbers
 
 
@@ -165,7 +136,7 @@ def _read_asf(path: Path) -> tuple[list[str], list[int], list[Bone], float]:
         if words[0].startswith(":"):
             sections[words[0].lower()] = rows = []
         elif not sections:
-            _fail(path, line, words[0][:40], "a section, such as :units")
+            fail(path, line, words[0][:40], "a section, such as :units")
         else:
             rows.append((line, words))
     if missing := [key for key in (":units", ":root", ":bonedata", ":hierarchy") if not sections.get(key)]:
@@ -180,11 +151,11 @@ def _read_unit(path: Path, rows: Sequence[tuple[int, list[str]]]) -> float:
     values = {words[0].lower(): (line, words[1:]) for line, words in rows}
     line, angle = values.get("angle", (rows[0][0], []))
     if angle != ["deg"]:
-        _fail(path, line, f"angle {' '.join(angle)}", "angle deg")
+        fail(path, line, f"angle {' '.join(angle)}", "angle deg")
     line, length = values.get("length", (rows[0][0], []))
     (factor,) = _parse_numbers(path, line, length, 1, "length")
     if factor <= 0:
-        _fail(path, line, f"length {factor:g}", "a factor above 0")
+        fail(path, line, f"length {factor:g}", "a factor above 0")
     return INCH / factor
 
 
@@ -193,7 +164,7 @@ def _read_root(path: Path, rows: Sequence[tuple[int, list[str]]]) -> Bone:
     for key in ("position", "orientation"):
         line, words = values.get(key, (rows[0][0], []))
         if any(_parse_numbers(path, line, words, 3, key)):
-            _fail(path, line, f"{key} {' '.join(words)}", "0 0 0")
+            fail(path, line, f"{key} {' '.join(words)}", "0 0 0")
     line, order = values.get("order", (rows[0][0], []))
     axis_line, axis = values.get("axis", (rows[0][0], []))
     axes = _parse_axes(path, axis_line, ["0", "0", "0", *axis])
@@ -207,14 +178,14 @@ def _read_bones(path: Path, rows: Sequence[tuple[int, list[str]]], unit: float) 
     for line, words in rows:
         key = words[0].lower()
         if (key == "begin") == inside:
-            _fail(path, line, words[0][:40], "begin, then the lines of one bone, then end")
+            fail(path, line, words[0][:40], "begin, then the lines of one bone, then end")
         inside = key != "end"
         if key not in ("begin", "end"):
             values[key] = line, words[1:]
         elif key == "end":
             name, bone = _read_bone(path, line, values, unit)
             if name in bones or name == ROOT:
-                _fail(path, line, f"a second bone {name}", "a unique name for each bone")
+                fail(path, line, f"a second bone {name}", "a unique name for each bone")
             bones[name], values = bone, {}
     if inside:
         raise InputError(f"{path}: the last bone of :bonedata has no end; expected an end line")
@@ -225,10 +196,10 @@ def _read_bone(
     path: Path, end: int, values: Mapping[str, tuple[int, list[str]]], unit: float
 ) -> tuple[str, Bone]:
     if missing := [key for key in ("name", "direction", "length", "axis") if key not in values]:
-        _fail(path, end, f"a bone without {missing[0]} ends here", "name, direction, length and axis")
+        fail(path, end, f"a bone without {missing[0]} ends here", "name, direction, length and axis")
     line, words = values["name"]
     if len(words) != 1:
-        _fail(path, line, f"name {' '.join(words)[:40]}", "one word")
+        fail(path, line, f"name {' '.join(words)[:40]}", "one word")
     direction = _parse_numbers(path, *values["direction"], 3, "direction")
     (length,) = _parse_numbers(path, *values["length"], 1, "length")
     axes = _parse_axes(path, *values["axis"])
@@ -239,19 +210,15 @@ def _read_bone(
 def _parse_axes(path: Path, line: int, words: Sequence[str]) -> Rotation:
     order = words[-1].lower() if words else ""
     if sorted(order) != ["x", "y", "z"]:
-        _fail(path, line, f"axis {' '.join(words)[:60]}", "an order of axes at the end, such as XYZ")
+        fail(path, line, f"axis {' '.join(words)[:60]}", "an order of axes at the end, such as XYZ")
     return Rotation.from_euler(order, _parse_numbers(path, line, words[:-1], 3, "axis"), degrees=True)
 
 
 def _parse_dofs(path: Path, line: int, words: Sequence[str], choices: Sequence[str]) -> tuple[str, ...]:
     dofs = tuple(word.lower() for word in words)
     if not dofs or not set(dofs) <= set(choices) or len(set(dofs)) < len(dofs):
-        _fail(
-            path,
-            line,
-            " ".join(words)[:60] or "no values",
-            f"one or more of {' '.join(choices)} without repetition",
-        )
+        expected = f"one or more of {' '.join(choices)} without repetition"
+        fail(path, line, " ".join(words)[:60] or "no values", expected)
     return dofs
 
 
@@ -263,10 +230,10 @@ def _read_hierarchy(
         if parent.lower() in ("begin", "end") and not children:
             continue
         if parent not in names:
-            _fail(path, line, parent[:40], "root, or a bone that is a child in an earlier line")
+            fail(path, line, parent[:40], "root, or a bone that is a child in an earlier line")
         for child in children:
             if child not in bones or child in names:
-                _fail(path, line, child[:40], "a bone of :bonedata without a parent in an earlier line")
+                fail(path, line, child[:40], "a bone of :bonedata without a parent in an earlier line")
             names.append(child)
             parents.append(names.index(parent))
     if left := sorted(set(bones) - set(names)):
@@ -284,7 +251,7 @@ def _read_frames(path: Path, widths: Mapping[str, int]) -> tuple[int, np.ndarray
 
     def finish() -> None:
         if missing := [name for name in widths if name not in frame]:
-            _fail(path, line, f"frame {last} without {missing[0]}", f"{len(widths)} bones in each frame")
+            fail(path, line, f"frame {last} without {missing[0]}", f"{len(widths)} bones in each frame")
         for name in widths:
             values.extend(frame[name])
         frame.clear()
@@ -294,14 +261,14 @@ def _read_frames(path: Path, widths: Mapping[str, int]) -> tuple[int, np.ndarray
             if last:
                 finish()
             if int(word) != last + 1 and last:
-                _fail(path, line, f"frame {word} after frame {last}", f"frame {last + 1}")
+                fail(path, line, f"frame {word} after frame {last}", f"frame {last + 1}")
             first, last = first or int(word), int(word)
         elif word.startswith(":"):
             if last or word.upper() == ":RADIANS":
-                _fail(path, line, word[:40], "frames in degrees, after all keywords")
+                fail(path, line, word[:40], "frames in degrees, after all keywords")
         elif not last or word not in widths or word in frame:
             expected = "a bone with angles, at most once per frame" if last else "a frame number"
-            _fail(path, line, word[:40], expected)
+            fail(path, line, word[:40], expected)
         else:
             frame[word] = _parse_numbers(path, line, numbers, widths[word], word)
     if not last:

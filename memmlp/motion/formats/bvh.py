@@ -8,8 +8,8 @@ Written files have 22 joints with end sites, centimetres, Y up, and the body's T
 
 import re
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import NoReturn
@@ -18,17 +18,15 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_file
-from memmlp.motion.body import JOINTS, PARENTS
+from memmlp.motion.body import CHILDREN, JOINTS, PARENTS
 from memmlp.motion.clip import FRAME_RATE_RANGE, USUAL_RATES, Clip, convert_to_y_up
-from memmlp.motion.formats.recording import END, Recording
+from memmlp.motion.formats.recording import END, LIMIT, Recording, fail, open_text
 
 AXES = "XYZ"
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
-LIMIT = 1e6  # maximum absolute value of all numbers in the file
 WORD = re.compile(r"(?<![^\s{}])(ROOT|JOINT)\s+([^{}]*[^{}\s])|([{}]|[^\s{}]+)", re.IGNORECASE)
 """A word of the hierarchy, or a keyword with a name; names may contain blanks."""
 MAX_JOINTS = 1000
-MAX_BYTES = 2**28  # about half an hour with 93 channels at 120 Hz
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, because the header has few digits
 COARSEST = 0.05  # relative: a more coarsely rounded frame time does not identify a usual rate
 
@@ -72,21 +70,12 @@ class Bvh(Recording):
             positions[node] = positions[parent] + rotations[parent] @ self.offsets[node]
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
-    def compute_pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        values: list[float] = []
-        for joint, channels in enumerate(self.channels):
-            count = sum(channel.endswith("rotation") for channel in channels)
-            angles = list(turns.get(self.nodes[joint], [0.0] * count))
-            if len(angles) != count:
-                raise InputError(
-                    f"{self.path}: rest.{self.nodes[joint]} has {len(angles)} values; "
-                    f"must have {count}, one per rotation channel"
-                )
-            for channel in channels:
-                shift = 0.0 if joint == 0 else self.offsets[joint][AXES.index(channel[0])]
-                values.append(angles.pop(0) if channel.endswith("rotation") else shift)
-        rotations, positions = replace(self, values=np.array([values])).compute_kinematics()
-        return rotations[0], positions[0]
+    def list_rest_values(self) -> list[list[float | None]]:
+        shifts = [np.zeros(3), *self.offsets[1 : len(self.channels)]]
+        return [
+            [None if name.endswith("rotation") else shift[AXES.index(name[0])] for name in channels]
+            for channels, shift in zip(self.channels, shifts, strict=True)
+        ]
 
 
 def _rotate(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
@@ -106,21 +95,13 @@ def read_bvh(path: Path) -> Bvh:
     file is damaged (braces, numbers, counts, names, channels, frame time, encoding), has more than 1000
     joints, or is larger than 256 MiB. The message has the file and if possible the line."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: too large; must be at most {MAX_BYTES >> 20} MiB")
-        with open(path, encoding="utf-8-sig") as file:
+        with open_text(path, "utf-8-sig") as file:
             lines = enumerate(file, start=1)
             names, parents, offsets, channels = _read_hierarchy(_WordReader(path, lines))
             fps, values = _read_motion(path, lines, sum(map(len, channels)))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a BVH file") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: invalid byte {error.object[error.start]:#04x}; must be UTF-8") from error
     return Bvh(path, tuple(names), tuple(parents), np.array(offsets), fps, values, tuple(channels))
-
-
-def _fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
-    raise InputError(f"{path}: line {line}: {wrong}; expected {expected}")
 
 
 class _WordReader:
@@ -139,11 +120,13 @@ class _WordReader:
         raise InputError(f"{self.path}: has no MOTION line; expected HIERARCHY, then MOTION")
 
     def fail(self, wrong: str, expected: str) -> NoReturn:
-        _fail(self.path, self.line, wrong, expected)
+        fail(self.path, self.line, wrong, expected)
+
+    def read_next(self) -> str | None:
+        return next(self._words, None)
 
     def read_word(self, expected: str) -> str:
-        word = next(self._words, None)
-        return word if word is not None else self.fail("the hierarchy ends too early", expected)
+        return self.read_next() or self.fail("the hierarchy ends too early", expected)
 
     def read_keyword(self, *keywords: str) -> str:
         """Read one of the keywords, and return it in capitals."""
@@ -166,10 +149,6 @@ class _WordReader:
         names = tuple(self.read_word(expected).capitalize() for _ in range(int(count)))
         wrong = next((name for name in names if name not in CHANNELS or names.count(name) > 1), None)
         return names if wrong is None else self.fail(_quote(wrong), expected)
-
-    def expect_end(self) -> None:
-        if (word := next(self._words, None)) is not None:
-            self.fail(_quote(word), "MOTION after the root's closing }")
 
 
 def _read_hierarchy(
@@ -208,7 +187,8 @@ def _read_hierarchy(
             offsets.append(words.read_offset())
             channels.append(words.read_channels())
         keyword = words.read_keyword("JOINT", "END", "}")
-    words.expect_end()
+    if (word := words.read_next()) is not None:
+        words.fail(_quote(word), "MOTION after the root's closing }")
     parents += [joint for joint, _ in ends.values()]
     offsets += [offset for _, offset in ends.values()]
     return [*names, *ends], parents, offsets, channels
@@ -219,22 +199,21 @@ def _read_motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tu
     rows = ((number, line.strip()) for number, line in lines if line.strip())
     first, second = next(rows, None), next(rows, None)
     if first is None or second is None or width == 0:
-        raise InputError(
-            f"{path}: has no motion; expected channels, Frames:, Frame Time: and the values of all frames"
-        )
+        expected = "channels, Frames:, Frame Time: and the values of all frames"
+        raise InputError(f"{path}: has no motion; expected {expected}")
     frames = _read_header(path, *first, "Frames:")
     if not re.fullmatch(r"0*[1-9]\d{0,8}", frames, re.ASCII):
-        _fail(path, first[0], f"Frames: {_quote(frames)}", "a whole number of at least 1")
+        fail(path, first[0], f"Frames: {_quote(frames)}", "a whole number of at least 1")
     low, high = FRAME_RATE_RANGE
     frame_time = _read_header(path, *second, "Frame Time:")
     if not 1 / high <= _parse_number(frame_time) <= 1 / low:
-        _fail(path, second[0], f"Frame Time: {_quote(frame_time)}", f"{1 / high:g} to {1 / low:g} s")
+        fail(path, second[0], f"Frame Time: {_quote(frame_time)}", f"{1 / high:g} to {1 / low:g} s")
     values = array("d")  # a list of rows would need much more memory
     for number, line in rows:
         values.extend(_read_frame(path, number, line.split(), width))
     if len(values) != int(frames) * width:
         wrong = f"Frames: {int(frames)}, but {len(values) // width} lines of values follow"
-        _fail(path, first[0], wrong, "one line per frame")
+        fail(path, first[0], wrong, "one line per frame")
     return _parse_rate(frame_time), np.array(values).reshape(-1, width)
 
 
@@ -256,19 +235,19 @@ def _read_header(path: Path, number: int, line: str, key: str) -> str:
     """Return the value in a line `key: value`. Letter case and blanks may vary."""
     pattern = key.replace(" ", r"\s*").replace(":", r"\s*:\s*(\S+)")
     match = re.fullmatch(pattern, line, re.IGNORECASE)
-    return match[1] if match else _fail(path, number, _quote(line), f"{key} and one number")
+    return match[1] if match else fail(path, number, _quote(line), f"{key} and one number")
 
 
 def _read_frame(path: Path, number: int, words: list[str], width: int) -> list[float]:
     if len(words) != width:
-        _fail(path, number, f"{len(words)} values", f"{width}, one per channel")
+        fail(path, number, f"{len(words)} values", f"{width}, one per channel")
     try:
         values = list(map(float, words))
     except ValueError:
         values = [float("nan")]
     if not all(abs(value) <= LIMIT for value in values) or any("_" in word for word in words):
         wrong = next((word for word in words if not abs(_parse_number(word)) <= LIMIT), words[0])
-        _fail(path, number, _quote(wrong), f"numbers of at most {LIMIT:g} in absolute value")
+        fail(path, number, _quote(wrong), f"numbers of at most {LIMIT:g} in absolute value")
     return values
 
 
@@ -305,16 +284,12 @@ def _format_joint(joint: int, rest: np.ndarray, indent: str) -> Iterator[str]:
     yield f"{indent}{{"
     yield f"{indent}\tOFFSET {_format_centimetres(offset)}"
     yield f"{indent}\tCHANNELS {3 if joint else 6} {position}Zrotation Xrotation Yrotation"
-    for child in _list_children(joint):
+    for child in CHILDREN[joint]:
         yield from _format_joint(child, rest, indent + "\t")
     if JOINTS[joint] in TIPS:
         tip = _format_centimetres(np.array(TIPS[JOINTS[joint]]))
         yield from (f"{indent}\t{line}" for line in ("End Site", "{", f"\tOFFSET {tip}", "}"))
     yield f"{indent}}}"
-
-
-def _list_children(joint: int) -> list[int]:
-    return [child for child, parent in enumerate(PARENTS) if parent == joint]
 
 
 def _format_centimetres(metres: np.ndarray) -> str:
@@ -326,7 +301,7 @@ def _format_motion(clip: Clip, rest: np.ndarray) -> Iterator[str]:
 
     def list_subtree(joint: int) -> Iterator[int]:  # in the hierarchy's order
         yield joint
-        for child in _list_children(joint):
+        for child in CHILDREN[joint]:
             yield from list_subtree(child)
 
     order, previous_angles = list(list_subtree(0)), None

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import memmlp
 from memmlp.common.files import atomic_file
-from memmlp.motion.body import HEAD, JOINTS, LIMBS, N_JOINTS, PARENTS, find_limb_ends
+from memmlp.motion.body import CHILDREN, HEAD, JOINTS, LIMBS, N_JOINTS, PARENTS, find_limb_ends
 from memmlp.motion.clip import Clip, convert_to_y_up
 
 COMPONENTS = {"<f4": 5126, "<u2": 5123, "|u1": 5121}  # glTF's codes for component types
@@ -30,11 +30,15 @@ def write_gltf(path: Path, clip: Clip, rest: np.ndarray) -> None:
     """Write a clip as a .glb file, atomically, on a body with rest joints `rest` (22, 3), metres."""
     buffer = Buffer()
     bind = rest - [0, rest[:, 1].min(), 0]  # the lowest joint on the floor
-    look = {"baseColorFactor": COLOUR, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     figure = build_skinned_figure(buffer, bind, [build_mannequin(bind)])
-    materials = [{"name": "mannequin", "pbrMetallicRoughness": look}]
-    animations = [_build_animation(buffer, clip, rest)]
-    write_glb(path, {**figure, "materials": materials, "animations": animations}, buffer)
+    content = {"materials": [make_material("mannequin", COLOUR, 0.7)]}
+    write_glb(path, {**figure, **content, "animations": [_build_animation(buffer, clip, rest)]}, buffer)
+
+
+def make_material(name: str, colour: tuple[float, float, float, float], roughness: float) -> dict[str, Any]:
+    """Make a material of a linear RGB colour with opacity."""
+    look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": roughness}
+    return {"name": name, "pbrMetallicRoughness": look}
 
 
 @dataclass
@@ -80,9 +84,8 @@ def build_skinned_figure(buffer: Buffer, bind: np.ndarray, parts: Sequence[Mesh]
     nodes: list[dict[str, Any]] = []
     for joint, parent in enumerate(PARENTS):
         offset = bind[joint] - (bind[parent] if joint else 0)
-        children = [child for child, above in enumerate(PARENTS) if above == joint]
         node = {"name": JOINTS[joint], "translation": offset.tolist()}
-        nodes.append(node | ({"children": children} if children else {}))
+        nodes.append(node | ({"children": CHILDREN[joint]} if CHILDREN[joint] else {}))
     inverse = np.tile(np.eye(4, dtype="<f4"), (N_JOINTS, 1, 1))
     inverse[:, 3, :3] = -bind  # glTF stores matrices by columns
     matrices = buffer.add(inverse, "MAT4")
@@ -149,9 +152,8 @@ def compute_continuous_quaternions(rotations: np.ndarray, previous: np.ndarray |
 
 def build_mannequin(bind: np.ndarray) -> Mesh:
     """Build a mannequin from round limbs in the bind pose (22, 3), metres."""
-    return merge_meshes(
-        [build_capsule(limb.first_joint, limb.radii, *find_limb_ends(limb, bind)) for limb in LIMBS]
-    )
+    ends = ((limb, find_limb_ends(limb, bind)) for limb in LIMBS)
+    return merge_meshes([build_capsule(limb.first_joint, limb.radii, *pair) for limb, pair in ends])
 
 
 def merge_meshes(parts: Sequence[Mesh]) -> Mesh:
@@ -199,22 +201,11 @@ def write_glb(path: Path, content: dict[str, Any], buffer: Buffer) -> None:
 
 # VRM 1.0 (vrm-consortium/vrm-specification, VRMC_vrm-1.0): a glTF file with the 22 joints as humanoid bones
 
-_MIDDLE = {
-    "pelvis": "Hips", "spine1": "Spine", "spine2": "Chest", "spine3": "UpperChest", "neck": "Neck",
-    "head": "Head",
-}  # fmt: skip
-_SIDES = {
-    "hip": "UpperLeg", "knee": "LowerLeg", "ankle": "Foot", "foot": "Toes", "collar": "Shoulder",
-    "shoulder": "UpperArm", "elbow": "LowerArm", "wrist": "Hand",
-}  # fmt: skip
-
-
-def _name_bone(joint: str) -> str:
-    side, _, name = joint.partition("_")
-    return side.capitalize() + _SIDES[name] if name else _MIDDLE[joint]
-
-
-UNITY_BONES = tuple(_name_bone(joint) for joint in JOINTS)
+UNITY_BONES = (
+    "Hips", "LeftUpperLeg", "RightUpperLeg", "Spine", "LeftLowerLeg", "RightLowerLeg", "Chest", "LeftFoot",
+    "RightFoot", "UpperChest", "LeftToes", "RightToes", "Neck", "LeftShoulder", "RightShoulder", "Head",
+    "LeftUpperArm", "RightUpperArm", "LeftLowerArm", "RightLowerArm", "LeftHand", "RightHand",
+)  # fmt: skip
 """Each joint's bone in Unity's HumanBodyBones."""
 
 VRM_BONES = tuple(name[0].lower() + name[1:] for name in UNITY_BONES)
@@ -255,18 +246,12 @@ def write_vrm(path: Path, rest: np.ndarray) -> None:
         "extensionsUsed": ["VRMC_vrm"],
         "extensions": {"VRMC_vrm": {"specVersion": "1.0", "meta": META, "humanoid": humanoid}},
     }
-    materials = []
-    for name, colour, roughness in LOOKS:
-        look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": roughness}
-        materials.append({"name": name, "pbrMetallicRoughness": look})
-    write_glb(path, {**figure, **extension, "materials": materials}, buffer)
+    write_glb(path, {**figure, **extension, "materials": [make_material(*look) for look in LOOKS]}, buffer)
 
 
 def build_eyes(bind: np.ndarray) -> Mesh:
     """Build the eyes for a bind pose (22, 3), metres: two upright ovals that show the head's direction."""
     radius, half, above, before = EYES
     middles = [bind[HEAD] + [side * half, above, before] for side in (-1, 1)]
-    up = np.array([0, radius / 2, 0])
-    return merge_meshes(
-        [build_capsule(HEAD, (radius, radius), middle - up, middle + up) for middle in middles]
-    )
+    up, radii = np.array([0, radius / 2, 0]), (radius, radius)
+    return merge_meshes([build_capsule(HEAD, radii, middle - up, middle + up) for middle in middles])

@@ -107,41 +107,26 @@ def convert_recording(
 
 @dataclass(frozen=True)
 class Stance:
-    """A stance in which the person faces +Z (Y up, metres).
+    """A stance in which the person faces +Z (Y up, metres). `untwisted` are the hips and shoulders (`HINGES`)
+    of limbs that do not turn about their bones from a zero pose that stands, and so are assumed to be without
+    twist."""
 
-    Attributes:
-        rotations: global rotations (22, 3, 3) of the mapped joints' nodes.
-        positions: positions (22, 3) of the mapped joints' nodes.
-        nodes: positions (nodes, 3) of all nodes in the file.
-        source: a description of the pose in the file.
-        untwisted: the hips and shoulders (`HINGES`) of limbs that do not turn about their bones from a zero
-            pose that stands, and so are assumed to be without twist.
-    """
-
-    rotations: np.ndarray
-    positions: np.ndarray
-    nodes: np.ndarray
-    source: str
+    rotations: np.ndarray  # global rotations (22, 3, 3) of the mapped joints' nodes
+    positions: np.ndarray  # positions (22, 3) of the mapped joints' nodes
+    nodes: np.ndarray  # positions (nodes, 3) of all nodes in the file
+    source: str  # a description of the pose in the file
     untwisted: frozenset[int]
 
 
 @dataclass(frozen=True)
 class Retargeting:
-    """The motion of a recording's mapped joints, and the constants that convert it to a body.
+    """The motion of a recording's mapped joints, and the constants that convert it to a body."""
 
-    Attributes:
-        skeleton: the recording's skeleton map, with a known unit and up axis.
-        motion: the mapped joints' motion.
-        stance: the pose that determines the corrections.
-        corrections: rotations (22, 3, 3), multiplied on the right of the nodes' rotations, in Y-up axes.
-        scale: the body's leg length divided by the recording's.
-    """
-
-    skeleton: SkeletonMap
+    skeleton: SkeletonMap  # with a known unit and up axis
     motion: MappedMotion
-    stance: Stance
-    corrections: np.ndarray
-    scale: float
+    stance: Stance  # the pose that determines the corrections
+    corrections: np.ndarray  # rotations (22, 3, 3), on the right of the nodes' rotations, in Y-up axes
+    scale: float  # the body's leg length divided by the recording's
 
 
 def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotion) -> Stance:
@@ -203,9 +188,8 @@ def _compute_rest(
     if not isinstance(rest, int):
         return recording.compute_pose(rest)
     if rest >= len(recording):
-        raise InputError(
-            f"{recording.path}: rest: frame {rest}: must be one of frames 0 to {len(recording) - 1}"
-        )
+        allowed = f"one of frames 0 to {len(recording) - 1}"
+        raise InputError(f"{recording.path}: rest: frame {rest}: must be {allowed}")
     rotations, positions = recording.compute_kinematics()
     return rotations[rest], positions[rest] - positions[rest, 0]
 
@@ -242,12 +226,11 @@ def convert_to_body(fitted: Retargeting, rest: np.ndarray, name: str, fps: float
 
 def _aim_segments(motion: MappedMotion, turned: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Turn rotations (N, 22, 3, 3) in place until all segments have their directions in the recording."""
-    for start, end in (HIP_LINE, *list_segments(motion.mapped)):
-        joint = 0 if (start, end) == HIP_LINE else start
-        if joint > 0 or (start, end) == HIP_LINE:
-            there = motion.positions[:, end] - motion.positions[:, start]
-            bone = turned[:, joint] @ (rest[end] - rest[start])
-            turned[:, joint] = compute_least_rotation(bone, there) @ turned[:, joint]
+    segments = [(0, HIP_LINE), *((one.start, one) for one in list_segments(motion.mapped) if one.start > 0)]
+    for joint, (start, end) in segments:
+        there = motion.positions[:, end] - motion.positions[:, start]
+        bone = turned[:, joint] @ (rest[end] - rest[start])
+        turned[:, joint] = compute_least_rotation(bone, there) @ turned[:, joint]
     for joint in map(int, np.flatnonzero(~motion.mapped)):
         turned[:, joint] = turned[:, PARENTS[joint]]
     return turned
@@ -267,10 +250,8 @@ def _align_bend_axes(rotations: np.ndarray, stance: Stance, motion: MappedMotion
             continue
         middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
         along = rotations[joint] @ (rest[middle] - rest[joint])
-        rotations[joint] = (
-            anatomy.align_directions((along, along), (rotations[joint] @ np.array(rest_axis), axis))
-            @ rotations[joint]
-        )
+        twist = anatomy.align_directions((along, along), (rotations[joint] @ np.array(rest_axis), axis))
+        rotations[joint] = twist @ rotations[joint]
         lower = rotations[joint] @ (rest[end] - rest[middle])
         there = stance.positions[end] - stance.positions[middle]
         rotations[middle] = compute_least_rotation(lower, there) @ rotations[joint]
@@ -316,24 +297,17 @@ def view_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
 def find_unit_and_up(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap:
     """Return a copy of the map in which a missing unit or up axis is found from the recording. Raises
     InputError if they can't be found, or if the map's unit gives implausible leg lengths."""
-    nodes = {
-        joint: recording.nodes.index(node)
-        for joint, node in skeleton.joints.items()
-        if node in recording.nodes
-    }
+    known = {joint: node for joint, node in skeleton.joints.items() if node in recording.nodes}
+    nodes = {joint: recording.nodes.index(node) for joint, node in known.items()}
     positions = recording.compute_kinematics()[1][int(skeleton.calibration_frame) :]
     if not {JOINTS[joint] for joint in (0, HEAD, *LEGS, *LEGS.values())} <= set(nodes) or not len(positions):
         return skeleton  # `pick_joints` reports missing nodes
-    bones = [
-        positions[:, nodes[JOINTS[end]]] - positions[:, nodes[JOINTS[start]]] for start, end in LEGS.items()
-    ]
+    ends = [(nodes[JOINTS[start]], nodes[JOINTS[end]]) for start, end in LEGS.items()]
+    bones = [positions[:, end] - positions[:, start] for start, end in ends]
     leg = float(sum(np.linalg.norm(bone, axis=-1).mean() for bone in bones) / 2)
     trunk = positions[:, nodes["head"]] - positions[:, nodes["pelvis"]]
-    return replace(
-        skeleton,
-        up=skeleton.up or _find_up(recording, trunk, nodes),
-        unit=_find_unit(recording, skeleton, leg),
-    )
+    up = skeleton.up or _find_up(recording, trunk, nodes)
+    return replace(skeleton, up=up, unit=_find_unit(recording, skeleton, leg))
 
 
 def _find_unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
@@ -366,9 +340,8 @@ def _find_up(recording: Recording, trunk: np.ndarray, nodes: dict[str, int]) -> 
         zero, pose = recording.compute_zero_pose(), np.zeros((len(JOINTS), 3))
         for joint, node in nodes.items():
             pose[JOINTS.index(joint)] = zero[node]
-        standing = next(
-            (a for a, turn in UPRIGHT.items() if not anatomy.find_stance_fault(pose @ turn.T)), None
-        )
+        stances = (axis for axis, turn in UPRIGHT.items() if not anatomy.find_stance_fault(pose @ turn.T))
+        standing = next(stances, None)
     upright = along[moving] >= UPRIGHT_SHARE
     if upright and standing in (None, moving):
         return moving

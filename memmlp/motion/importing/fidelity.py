@@ -49,17 +49,10 @@ class LargestError(NamedTuple):
 
 @dataclass(frozen=True)
 class Fidelity:
-    """The deviations between an import and its file.
-
-    Attributes:
-        name: the file's path below the folder.
-        skeleton: name of the skeleton map.
-        frames: number of compared frames.
-        mm: maximum distance, millimetres, between a joint in the file and in the import. The import is posed
-            with the bone lengths in the file.
-        degrees: maximum angle, degrees, between the directions of a segment on the body and in the file.
-        faults: the clip's likely mistakes, one sentence each.
-    """
+    """The deviations between an import and its file, given by its path below the folder: the maximum
+    distance, millimetres, between a joint in the file and in the import, posed with the bone lengths in the
+    file; the maximum angle, degrees, between the directions of a segment on the body and in the file; and the
+    clip's likely mistakes, one sentence each."""
 
     name: str
     skeleton: str

@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import RECORD, describe_body, load_rest_joints
-from memmlp.motion.clip import FRAME_RATE_RANGE, SkippedFile
+from memmlp.motion.clip import FRAME_RATE_RANGE, SkippedFile, describe_first
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.formats.recording import Recording
 from memmlp.motion.geometry import limit_to_one_thread
@@ -42,10 +42,9 @@ from memmlp.motion.preparing.find_clips import find_files
 @dataclass(frozen=True)
 class ImportedClip:
     """One imported clip, as written to the record. `source` and `clip` are paths below the folders; `unit` is
-    the file's in metres, `up` its axis, `y` or `z`; rates are in Hz, `header_fps` None if the header has
-    none; `floor` is the subtracted height, metres at the body's scale, or None; `scale` is the body's size
-    divided by that in the file; `first_step` is that of `convert.measure_first_step`, 0 if the map excludes
-    frame 0; `faults` are those of `Fidelity`."""
+    the file's in metres, `up` its axis, `y` or `z`; rates are in Hz; `floor` is the subtracted height, metres
+    at the body's scale, or None; `scale` is the body's size divided by that in the file; `first_step` is that
+    of `convert.measure_first_step`, 0 if the map excludes frame 0; `faults` are those of `Fidelity`."""
 
     source: str
     sha256: str
@@ -76,26 +75,15 @@ class ImportReport:
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """The settings of an import.
+    """The settings of an import. `floor` is that of `convert_recording`."""
 
-    Attributes:
-        skeleton: the name of a shipped map, or the path of a map; None chooses by the joints of each file.
-        fps: folder below the source ("" for all) -> true frame rate, Hz. It overrides all other rates.
-        body: `builtin`, or an SMPL-H model.npz.
-        floor: `auto`: find the floor from the feet; `none`: keep all heights; or the floor's height in the
-            files, metres.
-        strict: whether a bad file raises an error; otherwise it is skipped and reported.
-        sound: whether to skip clips with likely mistakes; otherwise these clips are written and reported.
-        up: the files' up axis, `y` or `z`; None uses the map's.
-    """
-
-    skeleton: str | None = None
-    fps: Mapping[str, float] = field(default_factory=dict)
-    body: str = "builtin"
+    skeleton: str | None = None  # a shipped map's name, or a map's path; None chooses by each file's joints
+    fps: Mapping[str, float] = field(default_factory=dict)  # folder in the source ("": all) -> rate, Hz
+    body: str = "builtin"  # or an SMPL-H model.npz
     floor: str | float = AUTO
-    strict: bool = False
-    sound: bool = False
-    up: str | None = None
+    strict: bool = False  # whether a bad file raises an error; otherwise it is skipped and reported
+    sound: bool = False  # whether to skip clips with likely mistakes; otherwise they are written and reported
+    up: str | None = None  # the files' up axis, `y` or `z`; None uses the map's
 
 
 def import_folder(source: Path, out: Path, settings: ImportSettings | None = None) -> ImportReport:
@@ -119,8 +107,7 @@ def import_folder(source: Path, out: Path, settings: ImportSettings | None = Non
                 write_clip(folder / relative.with_suffix(".npz"), result.converted.clip)
                 clips.append(_describe_clip(relative, result))
             if not clips:
-                first = f"the first: {skipped[0].file}: {skipped[0].reason}"
-                raise InputError(f"{source}: no usable file of {len(files)}; {first}")
+                raise InputError(f"{source}: no usable file of {len(files)}{describe_first(skipped)}")
             report = ImportReport(tuple(clips), tuple(_write_notes(clips, settings)), tuple(skipped))
             _publish(folder, out, report, describe_body(settings.body, rest))
     except OSError as error:
@@ -157,7 +144,8 @@ def _convert_all(
     for relative, path in progress_bar(files.items(), "import", len(files)):
         try:
             recording = read_recording(path)
-            skeleton = find_skeleton(recording, user_map).replace_up_axis(settings.up)
+            skeleton = find_skeleton(recording, user_map)
+            skeleton = replace(skeleton, up=settings.up or skeleton.up)
             rate, name = find_rate(recording, relative, settings.fps), relative.with_suffix("").as_posix()
             with limit_to_one_thread():
                 converted = convert_recording(

@@ -32,28 +32,16 @@ SEPARATORS = re.compile(r"[\W_]+")
 
 @dataclass(frozen=True)
 class SkeletonMap:
-    """A map from the body's 22 joints to the nodes of a file's skeleton.
-
-    Attributes:
-        name: the map's name.
-        joints: body joint -> node in the file (a joint, or `<joint>.end`).
-        unit: the file's unit in metres; None finds it from the length of the legs.
-        up: the file's up axis, `y` or `z`; None finds it from the motion.
-        calibration_frame: whether frame 0 is a calibration pose instead of motion.
-        rest: a stance, as joint -> rotation values in degrees, like in a frame of the file, or the index of a
-            frame. None uses the zero pose if the person stands in it, else the straightest frame.
-    """
+    """A map from the body's 22 joints to the nodes of a file's skeleton. `rest` is a stance, as joint ->
+    rotation values in degrees, like in a frame of the file, or the index of a frame. None uses the zero pose
+    if the person stands in it, else the straightest frame."""
 
     name: str
-    joints: dict[str, str]
-    unit: float | None = None
-    up: str | None = None
-    calibration_frame: bool = False
+    joints: dict[str, str]  # body joint -> node in the file (a joint, or `<joint>.end`)
+    unit: float | None = None  # the file's unit in metres; None finds it from the length of the legs
+    up: str | None = None  # the file's up axis, `y` or `z`; None finds it from the motion
+    calibration_frame: bool = False  # whether frame 0 is a calibration pose instead of motion
     rest: dict[str, list[float]] | int | None = None
-
-    def replace_up_axis(self, up: str | None) -> SkeletonMap:
-        """Return a copy with a different up axis, `y` or `z`; None changes nothing."""
-        return self if up is None else replace(self, up=up)
 
     @property
     def upright_rotation(self) -> np.ndarray:
@@ -212,7 +200,7 @@ def _parse_map(path: Path, content: object) -> SkeletonMap:
 
 
 def _is_rest(value: object) -> bool:
-    if value is None or not isinstance(value, dict) or not value:
+    if not isinstance(value, dict) or not value:
         return value is None
     angles = [angle for turns in value.values() for angle in (turns if isinstance(turns, list) else [None])]
     return all(map(_is_text, value)) and all(is_number(angle, -360, 360) for angle in angles)
@@ -232,23 +220,14 @@ def is_number(value: object, low: float, high: float) -> bool:
 
 @dataclass(frozen=True)
 class MappedMotion:
-    """A recording's motion of the mapped joints, in Y-up axes and metres.
-
-    Attributes:
-        path: the file, for messages.
-        mapped: whether each body joint has a node in the file (22,).
-        nodes: index of each body joint's node (22,); the parent joint's node for unmapped joints.
-        rotations: global rotations of the nodes (N, 22, 3, 3).
-        positions: positions of the nodes (N, 22, 3).
-        zero: positions of the nodes in the zero pose (22, 3), where all rotations are the identity.
-    """
+    """A recording's motion of the mapped joints, in Y-up axes and metres."""
 
     path: Path
-    mapped: np.ndarray
-    nodes: np.ndarray
-    rotations: np.ndarray
-    positions: np.ndarray
-    zero: np.ndarray
+    mapped: np.ndarray  # whether each body joint has a node in the file (22,)
+    nodes: np.ndarray  # index of each body joint's node (22,); the parent joint's node for unmapped joints
+    rotations: np.ndarray  # global rotations of the nodes (N, 22, 3, 3)
+    positions: np.ndarray  # positions of the nodes (N, 22, 3)
+    zero: np.ndarray  # positions in the zero pose (22, 3), where all rotations are the identity
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -267,21 +246,18 @@ def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
         while above not in (nodes[parent], -1):
             above = recording.node_parents[above]
         if above < 0:
-            raise InputError(
-                f"{recording.path}: {node} must be below {recording.nodes[nodes[parent]]} for skeleton "
-                f"{skeleton.name}; check the map"
-            )
-    rotations, positions = (
-        array[int(skeleton.calibration_frame) :, nodes] for array in recording.compute_kinematics()
-    )
+            wrong = f"{node} must be below {recording.nodes[nodes[parent]]} for skeleton {skeleton.name}"
+            raise InputError(f"{recording.path}: {wrong}; check the map")
+    first = int(skeleton.calibration_frame)
+    rotations, positions = (array[first:, nodes] for array in recording.compute_kinematics())
     if len(rotations) == 0:
         raise InputError(f"{recording.path}: has only the calibration frame; must have two frames or more")
-    upright_rotation, unit = skeleton.upright_rotation, skeleton.unit
+    upright, unit = skeleton.upright_rotation, skeleton.unit
     return MappedMotion(
         path=recording.path,
         mapped=np.array([joint in skeleton.joints for joint in JOINTS]),
         nodes=nodes,
-        rotations=upright_rotation @ rotations @ upright_rotation.T,
-        positions=unit * positions @ upright_rotation.T,
-        zero=unit * recording.compute_zero_pose()[nodes] @ upright_rotation.T,
+        rotations=upright @ rotations @ upright.T,
+        positions=unit * positions @ upright.T,
+        zero=unit * recording.compute_zero_pose()[nodes] @ upright.T,
     )

@@ -5,23 +5,21 @@ the split and the array sizes depend on. The second pass writes the frames. The 
 cache without a manifest is unfinished, and the next call prepares it again.
 """
 
-import hashlib
-import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from memmlp.common.errors import InputError, is_disk_error
+from memmlp.common.files import digest
 from memmlp.common.lease import Lock, check_owner, publish, temporary_path
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FRAME_DIM, check_imported_body, format_body_name, load_rest_joints
-from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample
+from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, describe_first, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.find_clips import NamedFolders, Root, find_clips
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, PARTS, ClipRecord, Manifest
@@ -88,13 +86,8 @@ def _plan_cache(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
 
     summary, split = survey_folder(source.root, source.min_frames, source.strict), source.split
     if not summary.clips:
-        first = (
-            f"; the first: {summary.skipped[0].file}: {summary.skipped[0].reason}" if summary.skipped else ""
-        )
-        raise InputError(
-            f"data.root={source.root}: no usable clip ({len(summary.skipped)} bad files{first}); "
-            "expected AMASS npz files"
-        )
+        bad = f"{len(summary.skipped)} bad files{describe_first(summary.skipped)}"
+        raise InputError(f"data.root={source.root}: no usable clip ({bad}); expected AMASS npz files")
     names = [clip.name for clip in summary.clips]
     parts, groups, duplicates = assign_parts(split, summary.clips)
     files = [*names, *summary.short, *summary.damaged_files]
@@ -107,7 +100,7 @@ def _plan_cache(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
     frames = [(clip.name, clip.split, clip.sha256) for clip in clips]
     ingredients = [FRAMES_VERSION, source.min_frames, rest.tolist(), frames]
     return Manifest(
-        digest=_hash_json([*ingredients, *([source.interpolation] if interpolated else [])]),
+        digest=digest([*ingredients, *([source.interpolation] if interpolated else [])]),
         request=request,
         body=format_body_name(source.body, rest),
         rest_joints=tuple(map(tuple, rest.tolist())),
@@ -194,7 +187,7 @@ def _compute_request_digest(source: ClipFolder, rest: np.ndarray) -> str:
     files = [(file, *_read_stamp(source.root / file)) for file in find_clips(source.root).files]
     code = [FORMAT, FRAMES_VERSION, VERSIONS["features"]]
     settings = [source.min_frames, source.interpolation, rest.tolist(), source.split.describe()]
-    return _hash_json([*code, *settings, files])
+    return digest([*code, *settings, files])
 
 
 def _read_stamp(path: Path) -> tuple[int, int, int]:
@@ -205,10 +198,6 @@ def _read_stamp(path: Path) -> tuple[int, int, int]:
     except OSError:
         return 0, 0, 0
     return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
-
-
-def _hash_json(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def _load_if_current(out: Path, request: str) -> Manifest | None:

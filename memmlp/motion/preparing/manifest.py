@@ -96,9 +96,9 @@ class Coverage:
     def gap_description(self) -> str:
         """A description of the missing entries, in total and by subset."""
         present, total = self.counts
-        by_subset = [
+        by_subset = (
             f"{name} {count} of {self.entry_counts[name]}" for name, count in self.missing_counts.items()
-        ]
+        )
         return f"{total - present} of {total} entries of the list have no clip ({', '.join(by_subset)})"
 
     def check(self, root: Root) -> None:
@@ -109,44 +109,25 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Manifest:
-    """The content of `manifest.json` in a cache.
-
-    Attributes:
-        digest: SHA-256 of everything that determines the frames and their parts. Groups are excluded,
-            because training does not use groups.
-        request: SHA-256 of the settings and each source file's path, size and times. It shows whether a
-            cache is outdated.
-        body: "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d".
-        rest_joints: rest positions (22, 3), metres.
-        split: the split's settings.
-        min_frames: minimum number of frames of a clip at 60 Hz.
-        interpolation: method of resampling to 60 Hz, one of `INTERPOLATIONS`.
-        clips: the clips, sorted by name.
-        skipped: bad files.
-        left_out: top-level folder -> number of valid clips without a part.
-        listed: subset -> number of its entries in the split's list; empty without a list.
-        missing: the split's entries without a valid clip; entries with a too short clip are not included.
-        duplicates: dropped clip -> the kept clip of another part that contains the same motion.
-        unusual: clip -> its likely mistakes (`plausibility.find_faults`).
-        sources: names of the sources, with which clip names begin; empty for one folder.
-        format: version of the cache format.
-    """
+    """The content of `manifest.json` in a cache. `digest` is a SHA-256 of everything that determines the
+    frames and their parts. Groups are excluded, because training does not use groups. `request` is a SHA-256
+    of the settings and each source file's path, size and times. It shows whether a cache is outdated."""
 
     digest: str
     request: str
-    body: str
-    rest_joints: tuple[tuple[float, ...], ...]
-    split: dict[str, Any]
-    min_frames: int
-    interpolation: str
-    clips: tuple[ClipRecord, ...]
-    skipped: tuple[SkippedFile, ...]
-    left_out: dict[str, int]
-    listed: dict[str, int]
-    missing: tuple[str, ...]
-    duplicates: dict[str, str]
-    unusual: dict[str, str]
-    sources: tuple[str, ...] = ()
+    body: str  # "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d"
+    rest_joints: tuple[tuple[float, ...], ...]  # (22, 3), metres
+    split: dict[str, Any]  # the split's settings
+    min_frames: int  # minimum number of frames of a clip at 60 Hz
+    interpolation: str  # method of resampling to 60 Hz, one of `INTERPOLATIONS`
+    clips: tuple[ClipRecord, ...]  # sorted by name
+    skipped: tuple[SkippedFile, ...]  # bad files
+    left_out: dict[str, int]  # top-level folder -> number of valid clips without a part
+    listed: dict[str, int]  # subset -> number of its entries in the split's list; empty without a list
+    missing: tuple[str, ...]  # the split's entries without a clip, not even a too short one
+    duplicates: dict[str, str]  # dropped clip -> the kept clip of another part with the same motion
+    unusual: dict[str, str]  # clip -> its likely mistakes (`plausibility.find_faults`)
+    sources: tuple[str, ...] = ()  # names of the sources, with which clip names begin; empty for one folder
     format: int = FORMAT
 
     @classmethod

@@ -20,20 +20,14 @@ class Kind:
 
 @dataclass(frozen=True)
 class PersonSplit(Split):
-    """A split by person, balanced over kinds of motion. The clips of a person are a group.
+    """A split by person, balanced over kinds of motion. The clips of a person are a group. The persons of
+    each kind are sorted by a hash of seed and id. The first persons are in test, the next in validation, and
+    all others in training. Persons without a kind are in training too.
 
-    The persons of each kind are sorted by a hash of seed and id. The first persons are in test, the next in
-    validation, and all others in training. Persons without a kind are in training too.
-
-    Args:
-        persons: pattern for clip names -> id of the person. `\\1` in the id is the pattern's first captured
-            group; None leaves the clips out. The first matching pattern applies.
-        kinds: name of a kind of motion -> its persons. A person must not have two kinds.
-        seed: seed of the order of persons.
-
-    Raises:
-        InputError: for an invalid pattern or id, a person with two kinds, or a kind with too few persons.
-    """
+    `persons` maps patterns for clip names to ids of persons; the first matching pattern applies. `\\1` in an
+    id is the pattern's first captured group; None leaves the clips out. `kinds` maps names of kinds of motion
+    to their persons. Raises InputError for an invalid pattern or id, a person with two kinds, or a kind with
+    too few persons."""
 
     persons: Mapping[str, str | None]
     kinds: Mapping[str, Kind]
@@ -59,7 +53,6 @@ class PersonSplit(Split):
 
     @property
     def parts(self) -> dict[str, str]:
-        """Person -> part, for all persons with a kind."""
         part_of: dict[str, str] = {}
         for kind in self.kinds.values():
             order = sorted(kind.persons, key=lambda person: make_sort_key(person, self.seed))
@@ -89,7 +82,6 @@ class PersonSplit(Split):
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
-        """Kind -> number of persons."""
         return {name: len(kind.persons) for name, kind in self.kinds.items()}
 
     def find_missing_entries(self, names: Collection[str]) -> tuple[str, ...]:

@@ -151,10 +151,7 @@ def make_sort_key(name: str, seed: int) -> str:
 def _count_groups(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
     """Return the number of groups of each part: the rounded fraction, but at least 1 unless it is 0; train
     has at least one."""
-    counts = {
-        part: max(1, round(part_fraction * total)) if part_fraction > 0 else 0
-        for part, part_fraction in fractions.items()
-    }
+    counts = {part: max(1, round(share * total)) if share > 0 else 0 for part, share in fractions.items()}
     needed = 1 + sum(count > 0 for count in counts.values())
     if total < needed:
         parts = ", ".join(["train", *(part for part, count in counts.items() if count)])
@@ -169,15 +166,11 @@ def _count_groups(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
 
 @dataclass(frozen=True, kw_only=True)
 class SeededSplit(GroupedSplit):
-    """A seeded random split.
-
-    Args:
-        test: fraction of the groups for test; 0 leaves test empty.
-        per_group: maximum number of clips of a group in test and in validation. The other clips are left out,
-            because repetitions of a motion add little information. None uses all clips.
-        divide: `groups`, or `clips`: the clips of a group may be in several parts, as in published lists. The
-            fractions are those of clips, and groups count in statistics only.
-    """
+    """A seeded random split. `test` is the fraction of the groups for test; 0 leaves test empty. `per_group`
+    is the maximum number of clips of a group in test and in validation. The other clips are left out, because
+    repetitions of a motion add little information. None uses all clips. `divide` is `groups`, or `clips`: the
+    clips of a group may be in several parts, as in published lists; the fractions are those of clips, and
+    groups count in statistics only."""
 
     test: float = 0.1
     val: float = 0.1
@@ -303,7 +296,6 @@ class ListSplit(PublishedSplit):
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
-        """Subset -> number of the split's entries."""
         return dict(Counter(entry.split("/")[0] for entry in sorted(self.entries)))
 
     def describe(self) -> dict[str, Any]:
@@ -346,7 +338,6 @@ class SubsetSplit(PublishedSplit):
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
-        """Subset -> number of the split's entries."""
         return dict.fromkeys((*self.train, *self.test), 1)
 
     def describe(self) -> dict[str, Any]:
@@ -373,10 +364,10 @@ def _check_one_release(matches: Iterable[Sequence[str]]) -> None:
     """Raise InputError if files from several AMASS releases are the same clip."""
     several = [clips for clips in matches if len(clips) > 1]
     if several:
-        first, second = several[0][:2]
+        files = " and ".join(f"{name}.npz" for name in several[0][:2])
         raise InputError(
-            f"data.root: {len(several)} clips of the split match more than one file, such as {first}.npz "
-            f"and {second}.npz; keep only one AMASS release below data.root"
+            f"data.root: {len(several)} clips of the split match more than one file, such as {files}; keep "
+            "only one AMASS release below data.root"
         )
 
 

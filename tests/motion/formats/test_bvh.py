@@ -123,7 +123,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert "0xb2" in refusal(write(tmp_path, SMALL.encode().replace(b" 8", b" \xb2")))
     for content in (np.random.default_rng(0).bytes(5000), b"\0" * 5000, b""):
         refusal(write(tmp_path, content))
-    monkeypatch.setattr("memmlp.motion.formats.bvh.MAX_BYTES", len(SMALL) - 1)
+    monkeypatch.setattr("memmlp.motion.formats.recording.MAX_BYTES", len(SMALL) - 1)
     assert "too large" in refusal(write(tmp_path, SMALL))
 
 
