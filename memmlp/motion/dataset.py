@@ -20,16 +20,10 @@ SHARE_STEPS = 2**52  # resolution of the sources' shares
 
 
 class MotionDataset:
-    """All clips of one part (train, val or test), concatenated.
-
-    Attributes:
-        frames: [X | Theta] (F, 252), float32, world.
-        starts: first frames of the clips (C,), int64, on the device of `frames`.
-        lengths: numbers of frames of the clips (C,), int64, on the device of `frames`.
-        names: names of the clips.
-        groups: group of each clip; dependent clips share a group. By default each clip has its own group.
-        sources: source of each clip; None if all clips are from one folder.
-    """
+    """All clips of one part (train, val or test), concatenated: `frames` [X | Theta] (F, 252), float32,
+    world, and the first frames and numbers of frames of the clips (C,), int64, on the same device. Dependent
+    clips share a group; by default each clip has its own group. `sources` is the source of each clip; None if
+    all clips are from one folder."""
 
     def __init__(
         self,

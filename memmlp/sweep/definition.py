@@ -17,7 +17,7 @@ from memmlp.evaluation.metric_facts import SMALLEST
 SWEEP_FILE = "sweep.json"
 """The copy of a sweep in its folder, from which its table can be shown without composing configs."""
 MODES = ("stream", "window")
-BRANCHES = ("rotation", "position", "combined")
+BRANCHES = ("rotation", "position", "combined")  # combined: after inverse kinematics
 SIZES = ("FLOPs", "MACs", "parameters", "size")
 """The costs of a network that depend neither on its training nor on the machine."""
 TIMES = ("ms", "network ms", "pose ms", "ratio", "FPS")
@@ -29,35 +29,21 @@ time, and frames per second."""
 
 @dataclass(frozen=True)
 class Variant:
-    """A row of a table.
+    """A row of a table. `overrides` are None for a row with only the paper's values, such as a system that
+    memmlp does not implement. `seeds` are None for those of the sweep; a variant has its own if seeds are
+    added only to variants with inconclusive verdicts."""
 
-    Attributes:
-        label: the variant's name in the table.
-        overrides: the variant's overrides of the base; None for a row with only the paper's values, such as a
-            system that memmlp does not implement.
-        branch: the branch that the row shows: rotation, position, or combined (after inverse kinematics).
-        paper: the paper's values by metric, as printed.
-        note: a remark shown under the table.
-        against: the label of the variant's control; None for the control of the sweep.
-        fixed: whether the sweep file sets the branch for this variant.
-        seeds: the variant's own seeds, if seeds are added only to variants with inconclusive verdicts; None
-            for the seeds of the sweep.
-        series: the variant's label in the file, without the overrides of the axes.
-        cell: the overrides that the axes add, one per key; empty without axes.
-        confounded: the other differences from the control that the label does not name; None without any.
-    """
-
-    label: str
-    overrides: tuple[str, ...] | None = ()
-    branch: str = "rotation"
-    paper: Mapping[str, float] | None = None
-    note: str | None = None
-    against: str | None = None
-    fixed: bool = False
+    label: str  # the variant's name in the table
+    overrides: tuple[str, ...] | None = ()  # of the base
+    branch: str = "rotation"  # the branch that the row shows, one of BRANCHES
+    paper: Mapping[str, float] | None = None  # the paper's values by metric, as printed
+    note: str | None = None  # a remark shown under the table
+    against: str | None = None  # the label of the variant's control; None for the control of the sweep
+    fixed: bool = False  # whether the sweep file sets the branch for this variant
     seeds: tuple[int, ...] | None = None
-    series: str = ""
-    cell: tuple[str, ...] = ()
-    confounded: str | None = None
+    series: str = ""  # the variant's label in the file, without the overrides of the axes
+    cell: tuple[str, ...] = ()  # the overrides that the axes add, one per key; empty without axes
+    confounded: str | None = None  # other differences from the control that the label does not name
 
     @property
     def own_overrides(self) -> tuple[str, ...]:
@@ -76,34 +62,20 @@ class VariantSeed:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The content of a sweep file, with overrides added on the command line.
+    """The content of a sweep file, with overrides added on the command line. `smallest` is the smallest
+    effect of interest for each metric except costs, in the metric's unit."""
 
-    Attributes:
-        name: the file's stem.
-        title: the table's title.
-        table: the table's number in the paper; None for a custom sweep.
-        notes: remarks shown under the table.
-        base: overrides that all variants share.
-        seeds: the seeds of each variant.
-        variants: the rows in order.
-        control: the label of the variant with which all other variants are compared.
-        metrics: the columns.
-        command_line: overrides given on the command line.
-        branch_source: the evidence for the branch of the paper's values; None if the file does not state it.
-        smallest: the smallest effect of interest for each metric except costs, in the metric's unit.
-    """
-
-    name: str
-    title: str
-    table: int | None
-    notes: tuple[str, ...]
-    base: tuple[str, ...]
-    seeds: tuple[int, ...]
-    variants: tuple[Variant, ...]
-    control: str
-    metrics: tuple[str, ...]
-    command_line: tuple[str, ...] = ()
-    branch_source: str | None = None
+    name: str  # the file's stem
+    title: str  # the table's title
+    table: int | None  # the table's number in the paper; None for a custom sweep
+    notes: tuple[str, ...]  # remarks shown under the table
+    base: tuple[str, ...]  # overrides that all variants share
+    seeds: tuple[int, ...]  # the seeds of each variant
+    variants: tuple[Variant, ...]  # the rows in order
+    control: str  # the label of the variant with which all other variants are compared
+    metrics: tuple[str, ...]  # the columns
+    command_line: tuple[str, ...] = ()  # overrides given on the command line
+    branch_source: str | None = None  # the evidence for the branch of the paper's values
     smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
 
     def with_branch(self, branch: str) -> Sweep:
@@ -132,10 +104,8 @@ class Sweep:
         if "paths.outputs" in keys:
             raise InputError("paths.outputs: expected --outputs FOLDER, or MEMMLP_OUTPUTS")
         if "save_predictions" in keys:
-            raise InputError(
-                "save_predictions: the runs of a sweep would overwrite each other's predictions; "
-                "use memmlp eval RUN --save-predictions FOLDER"
-            )
+            advice = "use memmlp eval RUN --save-predictions FOLDER"
+            raise InputError(f"save_predictions: the runs would overwrite each other's predictions; {advice}")
         setters = {
             parse_key(text): one.label
             for one in self.list_runnable()

@@ -53,7 +53,7 @@ def make_greeting(
         "fps": FPS,
         "joints": JOINTS,
         "outputs": [output.name for output in outputs.outputs] if outputs else [],
-        "limbs": [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS],
+        "limbs": [limb._asdict() for limb in LIMBS],
         "heat": HEAT,
         "top": TOP,
         "wearer": source.has_wearer,

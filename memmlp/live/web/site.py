@@ -49,9 +49,8 @@ EYES = 0.936
 """Eye height divided by body height (Drillis and Contini 1966, in Winter, Biomechanics and Motor Control of
 Human Movement, fig. 4.1). The page estimates the user's height from the height of the headset."""
 NUMBERS = 9 + 12 + 66
-"""Number of values per frame: positions and quaternions (xyzw) of head and wrists, and joint positions.
-
-Positions are in metres; all values are in openxr axes."""
+"""Number of values per frame: positions (metres) and quaternions (xyzw) of head and wrists, and joint
+positions, in openxr axes."""
 
 Entry = dict[str, Any]
 
@@ -113,7 +112,7 @@ class Site:
             unfinished.mkdir(parents=True)
             with naming_file(out):
                 self._write_contents(unfinished)
-            total = sum(path.stat().st_size for path in _list_files(unfinished))
+            total = sum(path.stat().st_size for path in unfinished.rglob("*") if path.is_file())
             earlier = temporary_path(out)
             if out.exists():
                 out.rename(earlier)
@@ -126,18 +125,18 @@ class Site:
     def _write_contents(self, folder: Path) -> None:
         for name, content in read_package_files(ONNXRUNTIME_WEB, RUNTIME).items():
             _write_file(folder, RUNTIME[name], content)
-        clips = [
-            {"key": clip.key, "name": clip.name, "frames": clip.frames}
-            | {"file": _write_file(folder, f"clips/{clip.key}.gz", clip.content)}
-            for clip in self.clips
-        ]
+        for clip in self.clips:
+            _write_file(folder, f"clips/{clip.key}.gz", clip.content)
         about: Entry = {
             "memmlp": __version__,
             "made": now(),
             "packages": {ONNXRUNTIME_WEB.name: ONNXRUNTIME_WEB.version},
             "networks": [write_network(folder, one) for one in self.networks],
-            "clips": clips,
-            "limbs": [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS],
+            "clips": [
+                {"key": clip.key, "name": clip.name, "frames": clip.frames, "file": f"clips/{clip.key}.gz"}
+                for clip in self.clips
+            ],
+            "limbs": [limb._asdict() for limb in LIMBS],
             "joints": JOINTS,
             "heat": HEAT,
             "top": TOP,
@@ -184,10 +183,6 @@ def write_network(folder: Path, network: SiteNetwork) -> Entry:
     }
 
 
-def _list_files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.is_file())
-
-
 def _write_file(folder: Path, address: str, content: bytes) -> str:
     """Write a file, and return its address on the site. Addresses with the suffix .gz are compressed."""
     path = folder / address
@@ -206,7 +201,8 @@ def _write_page(folder: Path) -> None:
     index = (folder / "index.html").read_text("utf-8")
     policy = build_security_policy(index, "'wasm-unsafe-eval'")
     _write_file(folder, "index.html", index.replace("POLICY", policy).encode())
-    digests = {str(file.relative_to(folder).as_posix()): file_digest(file) for file in _list_files(folder)}
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    digests = {file.relative_to(folder).as_posix(): file_digest(file) for file in files}
     version = hashlib.sha256(json.dumps(digests).encode()).hexdigest()[:16]
     others = [name for name in digests if name != "sw.js"]
     head = f"const VERSION = {json.dumps(version)};\nconst FILES = {json.dumps(others)};\n"

@@ -9,8 +9,6 @@ group.
 from __future__ import annotations
 
 import csv
-import hashlib
-import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -19,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import digest
 from memmlp.motion.preparing.amass_names import strip_archives
 from memmlp.motion.preparing.manifest import Manifest
 
@@ -44,9 +43,7 @@ class Grouping:
     @property
     def digest(self) -> str | None:
         """A digest of the column file's content; None without a file."""
-        if self.rows is None:
-            return None
-        return hashlib.sha256(json.dumps(sorted(self.rows.items())).encode()).hexdigest()
+        return None if self.rows is None else digest(sorted(self.rows.items()))
 
     def check(self, names: Collection[str], files: Iterable[str]) -> None:
         """Raise InputError unless the column file lists every clip of the split (`names`), and only existing
@@ -68,9 +65,8 @@ class Grouping:
         try:
             compiled = [re.compile(pattern) for pattern in self.patterns]
         except re.error as error:
-            raise InputError(
-                f"data.split.groups={error.pattern!r}: not a regular expression ({error})"
-            ) from error
+            wrong = f"data.split.groups={error.pattern!r}"
+            raise InputError(f"{wrong}: not a regular expression ({error})") from error
         order = sorted(aliases, key=lambda name: aliases[name])
         parents: dict[Any, Any] = {}
         for name in order:
@@ -102,9 +98,8 @@ def read_groups(file: Path) -> dict[str, str]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{KEY}={file}: cannot be read as CSV ({error})") from error
     if missing := [name for name in COLUMNS if name not in columns]:
-        raise InputError(
-            f"{KEY}={file}: has no column {missing[0]}; the first line must have the columns clip and group"
-        )
+        expected = "the first line must have the columns clip and group"
+        raise InputError(f"{KEY}={file}: has no column {missing[0]}; {expected}")
     groups: dict[str, str] = {}
     for line, row in rows:
         clip, group = ((row[name] or "").strip() for name in COLUMNS)
@@ -151,9 +146,8 @@ def describe_divided_folders(manifest: Manifest) -> str:
         ]
     if not folders:
         return ""
-    tested = (
-        f"{sum(count for _, count in folders)} test clips share no group with other clips (data.split.groups)"
-    )
+    count = sum(count for _, count in folders)
+    tested = f"{count} test clips share no group with other clips (data.split.groups)"
     more = f" and {len(folders) - 1} more" if len(folders) > 1 else ""
     return f"{tested}, but training has clips of the same folders ({folders[0][0] or 'the top folder'}{more})"
 

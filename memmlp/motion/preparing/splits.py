@@ -9,8 +9,6 @@ and name. So an additional clip changes the parts of few other clips. A smaller 
 subset of the clips of a larger one.
 """
 
-import hashlib
-import json
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import digest
 from memmlp.motion.preparing.amass_names import (
     find_present_subsets,
     make_clip_key,
@@ -117,8 +116,7 @@ class GroupedSplit(Split):
         self.grouping.check(names, files)
 
     def _describe_settings(self) -> dict[str, Any]:
-        digest = self.groups_digest
-        file = {"groups_file_sha256": digest} if digest else {}
+        file = {"groups_file_sha256": self.groups_digest} if self.groups_digest else {}
         fewer = {"train_fraction": self.train_fraction} if self.train_fraction < 1 else {}
         return {"val": self.val, "seed": self.seed, "groups": list(self.groups), **file, **fewer}
 
@@ -145,7 +143,7 @@ class GroupedSplit(Split):
 
 def make_sort_key(name: str, seed: int) -> str:
     """Return a sort key for a name, which gives a random order that depends only on the seed."""
-    return hashlib.sha256(json.dumps([seed, name]).encode()).hexdigest()
+    return digest([seed, name])
 
 
 def _count_groups(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
@@ -246,7 +244,7 @@ class MixedSplit(Split):
     @property
     def groups_digest(self) -> str | None:  # type: ignore[override]
         digests = {name: split.groups_digest for name, split in self.splits.items() if split.groups_digest}
-        return hashlib.sha256(json.dumps(digests, sort_keys=True).encode()).hexdigest() if digests else None
+        return digest(digests) if digests else None
 
     def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
         every = dict(self._split_names_by_source(files))
@@ -299,7 +297,7 @@ class ListSplit(PublishedSplit):
         return dict(Counter(entry.split("/")[0] for entry in sorted(self.entries)))
 
     def describe(self) -> dict[str, Any]:
-        lists = hashlib.sha256(json.dumps(sorted(self.entries.items())).encode()).hexdigest()
+        lists = digest(sorted(self.entries.items()))
         return {"kind": "lists", "lists_sha256": lists, **self._describe_settings()}
 
 

@@ -102,7 +102,7 @@ class Footwork:
         duration: float,
         delay: float,
         shift: Array,
-        turn: float = 0.0,
+        turn: float,
         first: int = 0,
         **step: Any,
     ) -> None:
@@ -110,22 +110,17 @@ class Footwork:
         floor at `off`, is in the air for `duration`, and the second follows after `delay`, all in seconds.
         `shift` is the translation of the stance's centre (2,), metres, world, `turn` the change of its
         heading, radians; `step` has further attributes of FootStep."""
-        s = self.stance = replace(
-            self.stance, center=self.stance.center + shift, heading=self.stance.heading + turn
-        )
+        old = self.stance
+        s = self.stance = replace(old, center=old.center + shift, heading=old.heading + turn)
         for foot, start in ((first, off), (1 - first, off + delay)):
             self.steps.append(FootStep(foot, start, start + duration, s.places[foot], s.yaws[foot], **step))
-
-    def build_feet(self, t: Array) -> Feet:
-        """Return the feet at the times t (N,), seconds."""
-        return apply_foot_steps(t, self.start.places, self.start.yaws, self.steps)
 
 
 def stand(rng: np.random.Generator, t: Array, style: Style, work: Footwork | None = None) -> Puppet:
     """Make a standing person with hanging arms and a little sway, whose body follows the feet."""
     fps = 1.0 / (t[1] - t[0])
     work = work or Footwork(FootPlacement(style.origin, style.heading, style.width, style.splay))
-    feet = work.build_feet(t)
+    feet = apply_foot_steps(t, work.start.places, work.start.yaws, work.steps)
     frames = round(FOLLOW * fps)
     heading = smooth(feet.yaw.mean(1), frames) + 0.02 * make_wander(rng, t)
     ground = feet.ground[..., :2]

@@ -41,10 +41,10 @@ def make_pulse(t: Array, start: float, top: float, leave: float, end: float) -> 
     return make_ease(t, start, top) - make_ease(t, leave, end)
 
 
-def make_glide(t: Array, start: float, end: float, ramp: float = 0.3) -> Array:
-    """Return a curve (N,) that rises from 0 at `start` to 1 at `end` with constant speed in the middle.
-
-    It accelerates at the start and slows down at the end, each for the fraction `ramp` of the time."""
+def make_glide(t: Array, start: float, end: float) -> Array:
+    """Return a curve (N,) that rises from 0 at `start` to 1 at `end` with constant speed in the middle. It
+    accelerates at the start and slows down at the end, each for 30 % of the time."""
+    ramp = 0.3
 
     def ramped(x: Array) -> Array:  # the integral of `make_ease` from 0 to 1
         c = np.clip(x, 0.0, 1.0)
@@ -255,17 +255,12 @@ def _solve_leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict
     name, sign = SIDES[side]
     ankle, foot = compute_ankle(puppet.feet, side)
     frames = round(puppet.settle * puppet.fps) // 2
-    pole = pelvis.apply([0.1 * sign, 0, 1.0]) + make_facing_rotation(puppet.feet.yaw[:, side]).apply(
-        [0, 0, 1.0]
-    )
-    thigh, shin = solve_two_bones(
-        root + pelvis.apply(_get_bone("pelvis", f"{name}_hip")),
-        ankle,
-        pole,
-        (_get_bone(f"{name}_hip", f"{name}_knee"), _get_bone(f"{name}_knee", f"{name}_ankle")),
-        LEG_POLE,
-        smooth(1.0 - _lengthen_steps(puppet.feet.planted[:, side], frames), frames),
-    )
+    ahead = make_facing_rotation(puppet.feet.yaw[:, side]).apply([0, 0, 1.0])
+    pole = pelvis.apply([0.1 * sign, 0, 1.0]) + ahead
+    hip = root + pelvis.apply(_get_bone("pelvis", f"{name}_hip"))
+    bones = _get_bone(f"{name}_hip", f"{name}_knee"), _get_bone(f"{name}_knee", f"{name}_ankle")
+    free = smooth(1.0 - _lengthen_steps(puppet.feet.planted[:, side], frames), frames)
+    thigh, shin = solve_two_bones(hip, ankle, pole, bones, LEG_POLE, free)
     return {
         f"{name}_hip": pelvis.inv() * thigh,
         f"{name}_knee": thigh.inv() * shin,
