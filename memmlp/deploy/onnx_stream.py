@@ -48,7 +48,6 @@ class OnnxStream:
 
     @property
     def state(self) -> Arrays:
-        """A copy of the current state."""
         return {name: array.copy() for name, array in self._state.items()}
 
     def reset(self) -> None:

@@ -93,7 +93,6 @@ class Outputs:
         self.failed: set[str] = set()
 
     def take(self, frame: BodyFrame) -> None:
-        """Send a frame to all outputs."""
         for output in self.outputs:
             try:
                 output.take(frame)
@@ -158,7 +157,6 @@ class VMC:
         self.start: float | None = None
 
     def take(self, frame: BodyFrame) -> None:
-        """Send the frame's bones, in two datagrams."""
         self.start = frame.time if self.start is None else self.start
         values = np.empty((N_JOINTS, 7))  # position (metres) and quaternion of each bone, parent's frame
         values[:, :3] = (frame.rest - frame.rest[list(PARENTS)]) * SPACE.body
@@ -183,7 +181,6 @@ class VRChat:
         self.receiver, self.close = receiver, receiver.socket.close
 
     def take(self, frame: BodyFrame) -> None:
-        """Send the frame's trackers, in one datagram."""
         parts = [f"{name}/{part}" for name in TRACKERS for part in ("position", "rotation")]
         vectors = place_trackers(frame).reshape(-1, 3).tolist()
         pairs = zip(parts, vectors, strict=True)

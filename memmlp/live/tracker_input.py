@@ -50,7 +50,6 @@ class TrackerReader:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all samples."""
         self.still, self.last, self.time = np.zeros(3), np.full((3, 12), np.nan), -math.inf
 
     def take(

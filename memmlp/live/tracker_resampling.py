@@ -92,7 +92,6 @@ class LostTrackerFiller:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all samples."""
         self.last: TrackerSample | None = None
         self.lost: Lost = NONE_LOST
         self.settled = -np.inf  # time when all returning trackers are at their true poses
@@ -154,7 +153,6 @@ class TrackerFrames:
 
     @property
     def next_time(self) -> float:
-        """The time of the next frame, seconds."""
         return self.origin + self.count / self.fps
 
     def take(

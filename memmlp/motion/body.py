@@ -167,7 +167,6 @@ class Limb(NamedTuple):
 
     @property
     def first_joint(self) -> int:
-        """The joint where the limb begins."""
         return self.end if self.tip else self.start
 
 

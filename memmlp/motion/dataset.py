@@ -57,7 +57,6 @@ class MotionDataset:
         return cls(frames, starts, lengths, names, groups, sources)
 
     def to(self, device: torch.device | str) -> MotionDataset:
-        """Return a copy of the dataset on a device."""
         tensors = (self.frames.to(device), self.starts.to(device), self.lengths.to(device))
         return MotionDataset(*tensors, list(self.names), list(self.groups), self.sources)
 

@@ -38,7 +38,6 @@ class PreparedMotion(NamedTuple):
         return self.manifest.digest
 
     def has(self, part: str) -> bool:
-        """Return whether a part has clips."""
         return bool(self.manifest.part(part))
 
     def open(self, part: str) -> MotionDataset:

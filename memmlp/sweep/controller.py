@@ -60,7 +60,6 @@ class Fleet:
             self.failed_starts += count
 
     def cancel(self) -> None:
-        """End all workers."""
         for handle, _ in self.handles:
             if handle.alive():
                 handle.cancel()

@@ -93,7 +93,6 @@ class Sweep:
         return variant.against or (self.control if variant.label != self.control else None)
 
     def get_seeds(self, variant: Variant) -> tuple[int, ...]:
-        """Return the seeds that a variant sets, else the seeds of the sweep."""
         return self.seeds if variant.seeds is None else variant.seeds
 
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:

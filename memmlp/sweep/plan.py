@@ -52,7 +52,6 @@ class Entry:
 
     @property
     def key(self) -> str:
-        """The key of the entry's task."""
         return " ".join((self.id, *self.stages))
 
 
@@ -90,7 +89,6 @@ class Plan:
         return {(entry.label, entry.seed): entry.id for entry in self.entries}
 
     def get_run(self, task: RunTask | Entry) -> Run:
-        """Return the run of a task or entry."""
         return Run.from_id(self.outputs, task.id)
 
     def is_complete(self, task: RunTask | Entry) -> bool:
@@ -127,7 +125,6 @@ class Plan:
         return sorted(left, key=lambda task: task.id not in first)
 
     def save(self, path: Path) -> None:
-        """Write the plan to a file atomically."""
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, {**asdict(self), "outputs": str(self.outputs)})
 

@@ -73,7 +73,6 @@ class Screen:
 
 
 def make_titled_table(title: str) -> Table:
-    """Return an empty table with a title."""
     return Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
 
 
@@ -83,7 +82,6 @@ class Board(Screen):
     before: Mapping[str, str] | None = None
 
     def update(self, plan: Plan, states: Mapping[str, str]) -> None:
-        """Show the plan with these states of its tasks."""
         done = f"{sum(state == 'done' for state in states.values())} of {len(states)} done"
         changed = [
             task for task in plan.tasks if self.before and self.before.get(task.key) != states[task.key]
@@ -156,7 +154,6 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
 
 
 def format_state(plan: Plan, task: RunTask, state: str) -> Text:
-    """Return a short text for the state of a task's run."""
     run, style = plan.get_run(task), COLOURS.get(state, "")
     if state == "running":
         return Text(describe_progress(run), style=style)

@@ -86,7 +86,6 @@ class Hub:
         self.publish_state("greeting", greeting)
 
     def publish(self, message: Mapping[str, Any]) -> None:
-        """Send a frame's message to all open pages."""
         with self.changed:
             self.frames.append((self._count_up(), encode_event("frame", message)))
 
@@ -120,7 +119,6 @@ class Hub:
 
 
 def encode_event(name: str, value: Mapping[str, Any]) -> bytes:
-    """Encode a value as a server-sent event."""
     return f"event: {name}\ndata: {json.dumps(value, separators=(',', ':'))}\n\n".encode()
 
 

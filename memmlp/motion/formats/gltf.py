@@ -157,7 +157,6 @@ def build_mannequin(bind: np.ndarray) -> Mesh:
 
 
 def merge_meshes(parts: Sequence[Mesh]) -> Mesh:
-    """Merge several meshes into one."""
     starts = np.cumsum([0, *(len(part.positions) for part in parts)])
     triangles = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
     positions, normals, joints = map(np.concatenate, zip(*(part[:3] for part in parts), strict=True))

@@ -75,5 +75,4 @@ def open_text(path: Path, encoding: str) -> Iterator[TextIO]:
 
 
 def fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
-    """Raise InputError for a line of a file."""
     raise InputError(f"{path}: line {line}: {wrong}; expected {expected}")

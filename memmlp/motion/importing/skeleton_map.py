@@ -50,7 +50,6 @@ class SkeletonMap:
 
 
 def list_shipped_skeletons() -> tuple[str, ...]:
-    """List the names of the maps in the package."""
     return tuple(sorted(path.stem for path in SKELETONS.glob("*.yaml")))
 
 

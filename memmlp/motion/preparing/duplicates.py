@@ -3,8 +3,8 @@
 There are four kinds of copies. The first has equal frames, even if the file was saved again. The second has
 a different frame rate (`find_resampled_copies`). The third shares a stretch of motion, such as overlapping
 cuts or a clip played backwards (`find_shared_stretches`). The fourth is another conversion of a take
-(`conversions.find_conversions`). Clips are also compared with mirror images, because
-some data sets contain mirrored motion. Clips without motion do not count as copies.
+(`find_conversions`). Clips are also compared with mirror images, because some data sets contain mirrored
+motion. Clips without motion do not count as copies.
 
 If the split divides all clips in the folder, all copies of a clip get the same part. A published list may
 have copies in several parts. Then only the copies in one part stay: test has priority over validation, and
@@ -227,22 +227,29 @@ def find_shared_stretches(
         return compute_local_rotations(resample(clip, interpolation=LINES)[0])
 
     every = [marks[clip.name][side] for side in (0, 1) for clip in clips]  # originals, then mirror images
-    owners = np.repeat(np.arange(len(every)), [len(one.frames) for one in every])
-    if not len(owners):
-        return
-    frames = np.concatenate([one.frames for one in every])
-    near = cKDTree(np.concatenate([one.signatures for one in every])).query_pairs(NEAR, output_type="ndarray")
     done: set[tuple[int, int]] = set()
-    for mark, other in np.sort(near, axis=1):
-        one, mirrored = int(owners[mark]), int(owners[other]) >= len(clips)
-        two = int(owners[other]) - len(clips) * mirrored
+    for one, frame, other, other_frame in _pair_marked_frames(every, NEAR):
+        mirrored = other >= len(clips)
+        two = other - len(clips) * mirrored
         pair = min(one, two), max(one, two)
         if one >= len(clips) or pair in done or clips[one].content == clips[two].content:
             continue
         seen = mirror_rotations(read_rotations(two)) if mirrored else read_rotations(two)
-        if _has_same_rotations(read_rotations(one), frames[mark], seen, frames[other]):
+        if _has_same_rotations(read_rotations(one), frame, seen, other_frame):
             done.add(pair)
             yield clips[pair[0]], clips[pair[1]]
+
+
+def _pair_marked_frames(
+    marks: Sequence[MarkedFrames], distance: float
+) -> Iterator[tuple[int, int, int, int]]:
+    """Yield pairs of marked frames with signatures up to a distance: the index in `marks`, and the frame."""
+    owners = np.repeat(np.arange(len(marks)), [len(one.frames) for one in marks])
+    if len(owners):
+        frames = np.concatenate([one.frames for one in marks])
+        tree = cKDTree(np.concatenate([one.signatures for one in marks]))
+        for one, two in np.sort(tree.query_pairs(distance, output_type="ndarray"), axis=1):
+            yield int(owners[one]), int(frames[one]), int(owners[two]), int(frames[two])
 
 
 def _has_same_rotations(one: np.ndarray, frame: int, other: np.ndarray, other_frame: int) -> bool:
@@ -291,23 +298,18 @@ def find_conversions(
 ) -> Iterator[tuple[ClipRecord, ClipRecord]]:
     """Yield pairs of clips that are conversions of one take and have different `content`. `marks` has clip ->
     its marked frames (`mark_turns`)."""
-    owners = np.repeat(np.arange(len(clips)), [len(marks[clip.name].frames) for clip in clips])
-    if not len(owners):
-        return
 
     @lru_cache(maxsize=16)
     def bones(index: int) -> np.ndarray:
         clip = resample(read_clip(root / clips[index].file, clips[index].name), interpolation=LINES)[0]
         return compute_clip_kinematics(clip, make_builtin_rest_joints())[0][:, BONES]
 
-    frames = np.concatenate([marks[clip.name].frames for clip in clips])
-    signatures = np.concatenate([marks[clip.name].signatures for clip in clips])
     done: set[tuple[int, int]] = set()
-    for mark, other in np.sort(cKDTree(signatures).query_pairs(TAKES_NEAR, output_type="ndarray"), axis=1):
-        one, two = int(owners[mark]), int(owners[other])
+    every = [marks[clip.name] for clip in clips]
+    for one, frame, two, other_frame in _pair_marked_frames(every, TAKES_NEAR):
         if (one, two) in done or clips[one].content == clips[two].content:
             continue
-        if _is_same_take(bones(one), frames[mark], bones(two), frames[other]):
+        if _is_same_take(bones(one), frame, bones(two), other_frame):
             done.add((one, two))
             yield clips[one], clips[two]
 

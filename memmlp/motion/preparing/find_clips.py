@@ -43,7 +43,6 @@ class NamedFolders:
         return "-".join(self.sources)
 
     def resolve(self) -> NamedFolders:
-        """Return a copy with absolute paths."""
         return NamedFolders({name: path.resolve() for name, path in self.sources.items()})
 
 

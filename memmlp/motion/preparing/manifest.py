@@ -52,7 +52,6 @@ class Total(NamedTuple):
 
     @property
     def hours(self) -> float:
-        """The total duration in hours."""
         return self.frames / FPS / 3600
 
 
@@ -79,7 +78,6 @@ class Coverage:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every entry has a clip."""
         return not self.missing_counts
 
     @property
@@ -94,7 +92,6 @@ class Coverage:
 
     @property
     def gap_description(self) -> str:
-        """A description of the missing entries, in total and by subset."""
         present, total = self.counts
         by_subset = (
             f"{name} {count} of {self.entry_counts[name]}" for name, count in self.missing_counts.items()
@@ -167,7 +164,6 @@ class Manifest:
 
     @property
     def coverage(self) -> Coverage:
-        """The numbers of the split's entries with and without a clip."""
         return Coverage.from_entries(self.listed, self.missing)
 
     @cached_property

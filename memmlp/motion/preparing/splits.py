@@ -105,7 +105,6 @@ class GroupedSplit(Split):
 
     @cached_property
     def grouping(self) -> Grouping:
-        """The rules that group clips."""
         return Grouping.from_settings(self.groups, self.groups_file)
 
     @property

@@ -43,7 +43,6 @@ class Style:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Style:
-        """Draw a random style."""
         out, bent = rng.uniform(0.05, 0.14), rng.uniform(0.0, 0.05)
         hands = np.array([[out, -0.515 + bent, 0.03 + bent]] * 2) + rng.normal(0, 0.012, (2, 3))
         return cls(
@@ -232,7 +231,6 @@ def draw_walking(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def draw_running(rng: np.random.Generator, t: Array) -> Puppet:
-    """Draw running with wide turns."""
     return _draw_locomotion(rng, t, RUN)
 
 

@@ -124,7 +124,6 @@ class ClipPiece:
         return gaussian_filter1d(self.truth[:, ROOT, :2], SMOOTHING * FPS, axis=0, mode="nearest")
 
     def find_seconds(self, frame: int) -> float:
-        """Return the time of a frame in the clip, seconds."""
         return (self.start + frame) / FPS
 
 

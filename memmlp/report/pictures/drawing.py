@@ -82,7 +82,6 @@ def get_pixels(figure: Figure) -> np.ndarray:
 
 
 def encode_png(figure: Figure) -> bytes:
-    """Draw a figure, and return it as a PNG file."""
     buffer = BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
@@ -210,6 +209,5 @@ def write_colour_scale(x: float, y: float, top: float) -> str:
 def write_text(
     x: float, y: float, text: str, size: int, weight: str = "normal", anchor: str = "start"
 ) -> str:
-    """Return a text as an SVG element."""
     style = f'font-size="{size}" font-weight="{weight}" text-anchor="{anchor}"'
     return f'<text x="{x:.0f}" y="{y:.0f}" {style}>{escape(text)}</text>'

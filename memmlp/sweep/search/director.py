@@ -39,7 +39,6 @@ class RunningTrial:
 
     @property
     def tasks(self) -> list[RunTask]:
-        """The requested tasks."""
         return [task for tasks in self.seeds[: self.seed_count] for task in tasks]
 
     @property

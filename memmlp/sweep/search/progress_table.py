@@ -52,12 +52,10 @@ def describe_end(trial: FrozenTrial) -> str:
 
 
 def list_runs(trial: FrozenTrial, outputs: Path) -> list[Run]:
-    """Return the runs that were requested for a trial."""
     return [Run.from_id(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
 
 
 def list_running_trials(study: Study, outputs: Path) -> list[tuple[FrozenTrial, list[Run]]]:
-    """Return each running trial with its runs."""
     return [(trial, list_runs(trial, outputs)) for trial in study.trials if trial.state not in ENDS]
 
 
@@ -107,7 +105,6 @@ def shorten_keys(keys: Iterable[str]) -> list[str]:
 
 
 def add_row(table: Table, search: Search, trial: FrozenTrial, state: Text) -> None:
-    """Add a trial's row to a table."""
     values = [Text(_short_value(trial.params.get(one.key, ""))) for one in search.space]
     table.add_row(str(trial.number), state, *values)
 

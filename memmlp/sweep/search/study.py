@@ -90,11 +90,9 @@ class Study:
 
     @property
     def is_full(self) -> bool:
-        """Whether the study has all trials of the search."""
         return len(self.trials) >= self.search.n_trials
 
     def ask(self) -> Trial:
-        """Start a trial and return it."""
         self.study.sampler = make_sampler(self.search, len(self.trials))
         return self._suggest_values(self.study.ask())
 
