@@ -1,17 +1,5 @@
-"""Export of one streaming step to ONNX. The state is an explicit input and output.
-
-Inputs:
-
-- `sparse` (1, 54): the world features of the newest frame (memmlp.motion.body defines their order).
-- `state.*`: the states; all zeros at the start.
-
-Outputs:
-
-- `rotation6d` (1, 22, 6): local rotations.
-- `position` (1, 22, 3): joint positions, metres, world. They come from the position branch, or from forward
-  kinematics if the network does not have a position branch.
-- `state.*.next`: the new states.
-"""
+"""Export of one streaming step to ONNX. The state is an explicit input and output; docs/guides/onnx.md
+describes all of them."""
 
 import json
 import logging

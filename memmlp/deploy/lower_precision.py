@@ -145,9 +145,8 @@ def _check_quantised(model: ModelProto, inner: Collection[str]) -> None:
     }
     layers = {node.name: node.input[1] for node in model.graph.node if node.name in inner}
     if skipped := [name for name in inner if layers.get(name) not in quantised]:
-        raise RuntimeError(
-            f"ONNX Runtime left {len(skipped)} of {len(inner)} layers in float32, such as {skipped[0]}"
-        )
+        count = f"{len(skipped)} of {len(inner)} layers"
+        raise RuntimeError(f"ONNX Runtime left {count} in float32, such as {skipped[0]}")
 
 
 def _correct_newest_frames(model: ModelProto, inner: Collection[str], corrected: tuple[str, ...]) -> None:
@@ -198,9 +197,8 @@ def convert_to_fp16(model: ModelProto, inner: Sequence[str]) -> ModelProto:
             if name in constants:
                 weight = constants.get_value(name)
                 if not np.abs(weight).max() <= LARGEST:
-                    raise InputError(
-                        f"export.precision=fp16: must be fp32; {name} has weights above {LARGEST:.0f}"
-                    )
+                    reason = f"{name} has weights above {LARGEST:.0f}"
+                    raise InputError(f"export.precision=fp16: must be fp32; {reason}")
                 node.input[index] = constants.add(f"{name}.half", weight.astype(np.float16))
             else:
                 if name not in halves:

@@ -1,26 +1,15 @@
 """Outputs of a live body: bones for VMC programs, trackers for VRChat, and recorded files.
 
 **VMC** (protocol.vmc.info/english) is an OSC protocol. VSeeFace, Warudo, EVMC4U and other programs receive
-it. Each frame has these messages:
+it. The root stays at the origin. The hips contain all movement, because some programs ignore root movement.
 
-- `/VMC/Ext/OK`: loaded, calibrated, normal mode (version 2.5).
-- `/VMC/Ext/T`: seconds since the start.
-- `/VMC/Ext/Root/Pos`: the root, which stays at the origin. The hips contain all movement, because some
-  programs ignore root movement.
-- `/VMC/Ext/Bone/Pos`, for each bone: name, position and quaternion xyzw in the parent's frame.
-
-The frame of reference is Unity's. The rest pose is a T-pose that faces +Z, where all rotations are the
-identity.
-
-**VRChat** (docs.vrchat.com/docs/osc-trackers) receives up to eight trackers and the head over OSC. Each has a
-position and a rotation, such as `/tracking/trackers/1/position`. Positions are in metres of the real world.
-Rotations are Euler angles in degrees, in the order Z, X, Y. The frame of reference is Unity's. VRChat assigns
-the trackers when the user calibrates in a T-pose. Then it aligns the head tracker with the avatar's head.
+**VRChat** (docs.vrchat.com/docs/osc-trackers) receives up to eight trackers and the head over OSC. Rotations
+are Euler angles in degrees, in the order Z, X, Y. VRChat assigns the trackers when the user calibrates in a
+T-pose. Then it aligns the head tracker with the avatar's head.
 
 **Recordings**: all files of a recorder contain the same frames. Formats with a skeleton (BVH, glTF) have the
-user's height. An npz file does not have a skeleton, so it contains the motion of the network's body. Missing
-frames between two poses are interpolated. After a longer break, the network restarts. Breaks are skipped in
-the files, and reported.
+user's height; an npz file contains the motion of the network's body. Missing frames between two poses are
+interpolated. After a longer break, the network restarts. Breaks are skipped in the files, and reported.
 """
 
 import errno

@@ -307,7 +307,7 @@ class Stream:
             head, left, right: the poses of the devices, see `step`.
 
         Returns:
-            The offsets. They can be passed to later streams.
+            The offsets, which can be passed to later streams.
 
         Raises:
             InputError: for a lost tracker, hands close together, a head that looks backwards relative to the

@@ -1,23 +1,7 @@
 """All computations from trackers to a body as one ONNX file, for programs without Python (`--scope full`).
 
-`memmlp.live.stream` does the same in Python.
-
-Inputs, one frame at 60 Hz:
-
-- `tracker_positions` (1, 3, 3): head, left and right wrist, metres.
-- `tracker_rotations` (1, 3, 3, 3): matrices of the same joints.
-- `state.*`: the states; all zeros at the start.
-
-Outputs:
-
-- `rotations` (1, 22, 3, 3): local matrices; the root rotation is global. With `rotations=quaternion`, they
-  are unit quaternions xyzw (1, 22, 4) with w >= 0.
-- `positions` (1, 22, 3): metres, by forward kinematics with the head on its tracker.
-- `joints` (1, 22, 3): metres, the positions that the network predicts.
-- `state.*.next`: the new states.
-
-All inputs and outputs are in the chosen frame of reference (memmlp.live.spaces). The caller must handle lost
-trackers, other rates and gaps (see memmlp.live.tracker_resampling). NaN inputs give NaN outputs.
+docs/guides/onnx.md describes the inputs and outputs. `memmlp.live.stream` does the same in Python, and also
+handles lost trackers, other rates and gaps. NaN inputs give NaN outputs.
 """
 
 from collections.abc import Callable
@@ -106,7 +90,7 @@ class FullStep(nn.Module):
         return own | self.model.initial_state(1)
 
     def forward(self, positions: Tensor, rotations: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Return the outputs and the new states in the order of the module docstring."""
+        """Return rotations, positions and joints, then the new states."""
         seen, last_positions, last_rotations = state[: len(OWN)]
         positions = positions @ self.world.T
         rotations = self.world @ rotations * self.body

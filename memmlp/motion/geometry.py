@@ -159,10 +159,7 @@ LEVELS: tuple[tuple[slice, list[slice]], ...] = (
     (slice(1, 4), [slice(0, 1)] * 3),  # hips and first spine joint on the pelvis
     (slice(4, 7), [slice(0, 3)]),
     (slice(7, 10), [slice(0, 3)]),
-    (
-        slice(10, 15),
-        [slice(0, 3), slice(2, 3), slice(2, 3)],
-    ),  # toes; neck and collars on the last spine joint
+    (slice(10, 15), [slice(0, 3), slice(2, 3), slice(2, 3)]),  # toes; neck, collars on the last spine joint
     (slice(15, 18), [slice(2, 5)]),
     (slice(18, 20), [slice(1, 3)]),
     (slice(20, 22), [slice(0, 2)]),
@@ -184,12 +181,8 @@ def compute_sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
     paper): global rotations (N, 3, 3, 3) and positions (N, 3, 3), metres, of head, left and right wrist.
     `memmlp.motion.body.SPARSE_*` has the layout. Frame 0 has no velocity and is dropped."""
     angular = rotations[:-1].transpose(-1, -2) @ rotations[1:]
-    parts = [
-        matrix_to_sixd(rotations[1:]),
-        matrix_to_sixd(angular),
-        positions[1:],
-        positions[1:] - positions[:-1],
-    ]
+    sixd, velocities = matrix_to_sixd(rotations[1:]), positions[1:] - positions[:-1]
+    parts = (sixd, matrix_to_sixd(angular), positions[1:], velocities)
     return torch.cat([part.flatten(1) for part in parts], 1)
 
 

@@ -49,10 +49,8 @@ class PreparedMotion(NamedTuple):
         part_of_cache = MotionDataset.open(self.cache, part)
         # Checked last, because arrays are replaced while the cache has no manifest.
         if Manifest.load(self.cache).digest != self.digest:
-            raise InputError(
-                f"{self.cache}: was prepared again from other clips during this run; start the run again, or "
-                "restore the clips"
-            )
+            changed = "was prepared again from other clips during this run"
+            raise InputError(f"{self.cache}: {changed}; start the run again, or restore the clips")
         return part_of_cache
 
 
@@ -71,9 +69,8 @@ class ShippedMotion:
         from memmlp.motion.dataset import MotionDataset
 
         if part != "test":
-            raise InputError(
-                f"{self.clip.stem}: a shipped network has only this clip; {part} clips need a run of your own"
-            )
+            only = "a shipped network has only this clip"
+            raise InputError(f"{self.clip.stem}: {only}; {part} clips need a run of your own")
         clip, _ = resample(read_clip(self.clip, self.clip.stem))
         frames = torch.from_numpy(np.concatenate(list(compute_frame_blocks(clip, self.rest))))
         return MotionDataset(frames, torch.tensor([0]), torch.tensor([len(frames)]), [clip.name])

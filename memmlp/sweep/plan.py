@@ -140,9 +140,8 @@ class Plan:
             content["cancelled"] = tuple(content["cancelled"])
             return cls(**{**content, "outputs": Path(content["outputs"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"{path}: must be the plan of a sweep ({error}); start the sweep again"
-            ) from None
+            expected = "must be the plan of a sweep"
+            raise InputError(f"{path}: {expected} ({error}); start the sweep again") from None
 
 
 def order_tasks(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:

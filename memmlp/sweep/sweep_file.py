@@ -92,10 +92,8 @@ def parse_sweep(name: str, content: Any) -> Sweep:
         raise InputError(f"control: '{control}'; expected one of {', '.join(map(repr, runnable))}")
     for variant in variants:
         if variant.against is not None and variant.against not in {*runnable} - {variant.label}:
-            raise InputError(
-                f"variants.{variant.label}.against: '{variant.against}'; "
-                "expected another variant with overrides"
-            )
+            wrong = f"variants.{variant.label}.against: '{variant.against}'"
+            raise InputError(f"{wrong}; expected another variant with overrides")
     table = content.get("table")
     if table is not None and (isinstance(table, bool) or not isinstance(table, int) or table < 1):
         raise InputError(f"table: {table!r}; expected the number of a table of the paper")
@@ -194,9 +192,8 @@ def _repeat_in_cells(variants: Sequence[Variant], cells: Sequence[tuple[str, ...
             yield variant
             continue
         if both := sorted(axes & {parse_key(text) for text in variant.overrides}):
-            raise InputError(
-                f"variant '{variant.label}': sets {both[0]}, which is also an axis; remove one of them"
-            )
+            wrong = f"sets {both[0]}, which is also an axis"
+            raise InputError(f"variant '{variant.label}': {wrong}; remove one of them")
         for cell in cells:
             yield replace(
                 variant,

@@ -1,16 +1,10 @@
 """Sources of tracker poses: a recorded clip, or packets from the network.
 
-One datagram is one sample, as JSON or as an OSC bundle. A pose is seven numbers, `x y z qx qy qz qw`: metres
-and a unit quaternion. A JSON example:
-
-    {"time": 12.25, "seq": 735, "head": [x, y, z, qx, qy, qz, qw], "left": null, "right": [...]}
-
-An OSC bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right` (seven floats each),
-`/memmlp/time` (a double or float) and `/memmlp/seq` (an integer).
-
-A tracker is lost if it is null or missing, or by the rules of `memmlp.live.tracker_input.find_lost`. In OSC,
-a message without numbers is null. A packet without a time gets its arrival time. `seq` is the number of the
-sample. It serves to count missing packets, and to drop packets that arrive out of order.
+One datagram is one sample, as JSON or as an OSC bundle (docs/guides/live.md). A pose is seven numbers, `x y z
+qx qy qz qw`: metres and a unit quaternion. A tracker is lost if it is null or missing, or by the rules of
+`memmlp.live.tracker_input.find_lost`. In OSC, a message without numbers is null. A packet without a time gets
+its arrival time. `seq` is the number of the sample. It serves to count missing packets, and to drop packets
+that arrive out of order.
 """
 
 import errno

@@ -148,9 +148,8 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
         rotations, nodes = _compute_rest(recording, skeleton.rest)
         pose = skeleton.unit * nodes[motion.nodes] @ upright.T
         if (fault := anatomy.find_stance_fault(pose)) is not None:
-            raise InputError(
-                f"{path}: rest in skeleton {skeleton.name} ({source}) must be an upright stance, but {fault}"
-            )
+            where = f"rest in skeleton {skeleton.name} ({source})"
+            raise InputError(f"{path}: {where} must be an upright stance, but {fault}")
         return stance(upright @ rotations[motion.nodes] @ upright.T, pose, nodes, source)
     if stands:
         identities = np.tile(np.eye(3), (len(motion.zero), 1, 1))
@@ -322,10 +321,9 @@ def _find_unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float
         return skeleton.unit
     fitting = [unit for unit in UNITS if LEG_LENGTH[0] <= leg * unit <= LEG_LENGTH[1]]
     if not fitting:
-        raise InputError(
-            f"{recording.path}: no unit found, because the legs are {leg:.3g} units long; set unit in the "
-            f"skeleton map (tried {', '.join(f'{unit:.4g}' for unit in UNITS)} m)"
-        )
+        wrong = f"{recording.path}: no unit found, because the legs are {leg:.3g} units long"
+        tried = ", ".join(f"{unit:.4g}" for unit in UNITS)
+        raise InputError(f"{wrong}; set unit in the skeleton map (tried {tried} m)")
     return min(fitting, key=lambda unit: abs(leg * unit - 0.85))
 
 

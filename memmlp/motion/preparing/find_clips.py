@@ -23,10 +23,8 @@ class NamedFolders:
         """Name each folder by the last component of its path. Raises InputError for equal names."""
         sources = {path.resolve().name: path for path in paths}
         if len(sources) < len(paths):
-            raise InputError(
-                f"data.root={', '.join(map(str, paths))}: two folders have the same name; "
-                "give them names in data.sources"
-            )
+            wrong = f"data.root={', '.join(map(str, paths))}: two folders have the same name"
+            raise InputError(f"{wrong}; give them names in data.sources")
         return cls(sources)
 
     def __truediv__(self, file: str) -> Path:
@@ -88,9 +86,8 @@ def _find_in_folder(root: Path) -> FolderContent:
         raise InputError(f"data.root={root}: no such folder; must be the folder of your npz clips")
     content = find_files(root, SUFFIX)
     if not content.files:
-        raise InputError(
-            f"data.root={root}: has no npz files; create them with memmlp data synth or memmlp data import"
-        )
+        advice = "create them with memmlp data synth or memmlp data import"
+        raise InputError(f"data.root={root}: has no npz files; {advice}")
     return content
 
 

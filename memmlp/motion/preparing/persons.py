@@ -39,9 +39,8 @@ class PersonSplit(Split):
             try:
                 re.compile(f"{pattern}|").search("").expand(person or "")  # type: ignore[union-attr]
             except (re.error, IndexError) as error:
-                raise InputError(
-                    f"data.split.persons={pattern!r}: {error}; must map a valid pattern to a valid id"
-                ) from error
+                expected = "must map a valid pattern to a valid id"
+                raise InputError(f"data.split.persons={pattern!r}: {error}; {expected}") from error
         every = [person for kind in self.kinds.values() for person in kind.persons]
         if twice := sorted({person for person in every if every.count(person) > 1}):
             raise InputError(f"data.split.kinds: {twice[0]} has two kinds; a person must have only one kind")
@@ -75,10 +74,8 @@ class PersonSplit(Split):
         for pattern, person in self.persons.items():
             if match := re.search(pattern, name):
                 return person and match.expand(person)
-        raise InputError(
-            f"data.split.persons: no pattern matches {name}; add a pattern with the person's id, or "
-            "with null to leave the clip out"
-        )
+        advice = "add a pattern with the person's id, or with null to leave the clip out"
+        raise InputError(f"data.split.persons: no pattern matches {name}; {advice}")
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]

@@ -99,9 +99,8 @@ class GroupedSplit(Split):
             if not 0 <= value < 1:
                 raise InputError(f"data.split.{key}={value}: must be at least 0 and below 1")
         if sum(fractions.values()) >= 1:
-            raise InputError(
-                "data.split.test, data.split.val: the sum must be less than 1, because training gets the rest"
-            )
+            expected = "the sum must be less than 1, because training gets the rest"
+            raise InputError(f"data.split.test, data.split.val: {expected}")
 
     @cached_property
     def grouping(self) -> Grouping:
@@ -376,10 +375,8 @@ def _read_lists(folder: Path) -> dict[str, str]:
     every = [(part, file) for part in LISTED for file in files[part]]
     for subfolder, part in product(sorted({file.parent for _, file in every}), LISTED):
         if subfolder / f"{part}_split.txt" not in files[part]:
-            raise InputError(
-                f"data.split.folder={folder}: {subfolder} lacks {part}_split.txt; each subset must have both "
-                "lists; a list may be empty"
-            )
+            wrong = f"data.split.folder={folder}: {subfolder} lacks {part}_split.txt"
+            raise InputError(f"{wrong}; each subset must have both lists; a list may be empty")
     entries: dict[str, str] = {}
     for part, file in every:
         for name in _read_list(file):

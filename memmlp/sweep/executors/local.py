@@ -51,10 +51,8 @@ def divide_gpus(gpus: GpuGroup, per_worker: int | None = None) -> list[GpuGroup]
     worker. The rest stays idle. Raises InputError if `per_worker` is greater than the number of GPUs."""
     size = per_worker if per_worker is not None else min(len(gpus), 1)
     if size > len(gpus):
-        names = ", ".join(gpus) or "no GPU"
-        raise InputError(
-            f"--gpus-per-worker {size}: must be at most {len(gpus)}, the number of visible GPUs ({names})"
-        )
+        visible = f"the number of visible GPUs ({', '.join(gpus) or 'no GPU'})"
+        raise InputError(f"--gpus-per-worker {size}: must be at most {len(gpus)}, {visible}")
     return [gpus[i : i + size] for i in range(0, len(gpus) - size + 1, size)] if size else []
 
 

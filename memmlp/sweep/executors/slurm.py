@@ -76,9 +76,8 @@ def _parse_parameter(key: str, value: str) -> dict[str, str | bool]:
     if key in RESERVED:
         raise InputError(f"slurm.{key}: is set by memmlp; expected another sbatch option")
     if key in FIXED_TO_ONE:
-        raise InputError(
-            f"slurm.{key}: cannot be set, because a worker is one task on one node; use --workers N"
-        )
+        reason = "cannot be set, because a worker is one task on one node"
+        raise InputError(f"slurm.{key}: {reason}; use --workers N")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", key) or not value or not value.isprintable():
         raise InputError(f"slurm.{key}={value}: expected the long name of an sbatch option, and a value")
     if key == "mem_gb":

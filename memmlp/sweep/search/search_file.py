@@ -140,10 +140,7 @@ class Search:
 
 
 def _make_whole_number_rule(least: int) -> Rule:
-    def allows(value: Any) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool) and value >= least
-
-    return Rule(f"a whole number of at least {least}", allows)
+    return Rule(f"a whole number of at least {least}", lambda value: type(value) is int and value >= least)
 
 
 def _is_text_list(value: Any) -> bool:
@@ -189,9 +186,8 @@ def parse_search(content: Mapping[str, Any], best: Mapping[str, Value] | None = 
     if not space:
         raise InputError("search.space: empty; expected config keys with low and high, or with choices")
     if len(objectives) not in (1, 2) or len({one.text for one in objectives}) < len(objectives):
-        raise InputError(
-            "search.objectives: expected one objective, or two different objectives for a Pareto front"
-        )
+        expected = "one objective, or two different objectives for a Pareto front"
+        raise InputError(f"search.objectives: expected {expected}")
     if len(objectives) > 1 and values["pruner"] != "none":
         raise InputError(f"search.pruner={values['pruner']}: must be none with two objectives")
     if values["seeds"] != 1 and any(one.key == "seed" for one in space):
@@ -204,16 +200,12 @@ def parse_search(content: Mapping[str, Any], best: Mapping[str, Value] | None = 
 def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
     for one in space:
         if not one.choices or one.first is not None:
-            raise InputError(
-                f"search.space.{one.key}: must have choices, without low, high and first, if "
-                "search.sampler=grid"
-            )
+            expected = "must have choices, without low, high and first"
+            raise InputError(f"search.space.{one.key}: {expected}, if search.sampler=grid")
     combinations = math.prod(len(one.choices) for one in space)
     if n_trials != combinations:
-        raise InputError(
-            f"search.n_trials={n_trials}: must be {combinations}, the number of combinations, with "
-            "search.sampler=grid"
-        )
+        expected = f"must be {combinations}, the number of combinations"
+        raise InputError(f"search.n_trials={n_trials}: {expected}, with search.sampler=grid")
 
 
 def _parse_ranges(node: Any, prefix: str, best: Mapping[str, Value]) -> Iterator[Range]:
@@ -278,9 +270,8 @@ def _parse_interval(key: str, node: Mapping[str, Any], where: str) -> Range:
         raise InputError(f"{where}.step={step}: must be above 0, and cannot be combined with log")
     for name, value in (("step", step), ("first", first)):
         if isinstance(low, int) and isinstance(high, int) and not isinstance(value, int | None):
-            raise InputError(
-                f"{where}.{name}={value}: must be a whole number if low and high are whole numbers"
-            )
+            expected = "must be a whole number if low and high are whole numbers"
+            raise InputError(f"{where}.{name}={value}: {expected}")
     if step is not None and step > high - low:
         raise InputError(f"{where}.step={step}: must be at most high - low")
     if step is not None and first is not None and abs((first - low) / step % 1 - 0.5) < 0.5 - 1e-9:
@@ -290,8 +281,7 @@ def _parse_interval(key: str, node: Mapping[str, Any], where: str) -> Range:
 
 def _parse_objective(text: str) -> Objective:
     """Parse an objective such as "MPJPE", or "MPJPE + 0.1*position Jitter"."""
-    terms = [_parse_term(part.strip(), text) for part in text.split("+")]
-    return Objective(text, tuple(terms))
+    return Objective(text, tuple(_parse_term(part.strip(), text) for part in text.split("+")))
 
 
 def _parse_term(part: str, text: str) -> tuple[float, str]:
@@ -305,9 +295,8 @@ def _parse_term(part: str, text: str) -> tuple[float, str]:
             f"and branch ({branches}) may be omitted, METRIC is one of {names}"
         )
     if metric in HIGHER:
-        raise InputError(
-            f"search.objectives: '{text}'; higher values of {metric} are better, so it cannot be minimised"
-        )
+        reason = f"higher values of {metric} are better, so it cannot be minimised"
+        raise InputError(f"search.objectives: '{text}'; {reason}")
     weight = float(match[1] or 1)
     if not 0 < weight < math.inf:
         raise InputError(f"search.objectives: '{text}'; weights must be above 0")
@@ -328,9 +317,8 @@ def read_best_trial(folder: Path) -> tuple[tuple[str, ...], dict[str, Value]]:
         raise InputError(damage)
     content = records.read(record, SearchRecord)
     if "command_line" not in content or not path.is_file():
-        raise InputError(
-            f"{folder}: must be the folder of a finished search, with search.json and trials.csv"
-        )
+        expected = "must be the folder of a finished search, with search.json and trials.csv"
+        raise InputError(f"{folder}: {expected}")
     objective, keys = content["objectives"][0]["text"], [one["key"] for one in content["space"]]
     try:
         trials = [row for row in parse_csv(path.read_text(encoding="utf-8")) if row["state"] == "complete"]
