@@ -15,12 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock, publish, temporary_path
 from memmlp.motion.clip import resample
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.preparing.cache import (
-    ClipFolder,
-    compute_frame_blocks,
-    load_finished_cache,
-    prepare_cache,
-)
+from memmlp.motion.preparing.cache import ClipFolder, compute_frame_blocks, load_finished_cache, prepare_cache
 from memmlp.motion.preparing.find_clips import find_clips, get_clip_name
 from memmlp.motion.preparing.manifest import Coverage, Manifest
 

@@ -33,15 +33,7 @@ from memmlp.common.errors import InputError, describe_read_error, escape_line_br
 from memmlp.common.overrides import format_value
 from memmlp.common.schema import parse_config_yaml
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
-from memmlp.sweep.definition import (
-    BRANCHES,
-    COSTS,
-    Sweep,
-    Variant,
-    parse_branch,
-    parse_key,
-    parse_seeds,
-)
+from memmlp.sweep.definition import BRANCHES, COSTS, Sweep, Variant, parse_branch, parse_key, parse_seeds
 
 KEYS = (
     "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",
