@@ -64,17 +64,13 @@ class Deployment:
         export(network, deployed.onnx, run_id, self.opset)
         clip = select_parity_clip(model, test)
         if len(clip) < count_frames_until_past_is_full(model):
-            announce(
-                f"export: the longest test clip has only {len(clip)} frames; "
-                "the comparison ends before the network's history is full"
-            )
+            short = f"the longest test clip has only {len(clip)} frames"
+            announce(f"export: {short}; the comparison ends before the network's history is full")
         apart = measure_differences(model, deployed.onnx, clip)
         worst = float(apart.max())
         if not are_rounding_errors(apart):
-            raise RuntimeError(
-                f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e}; "
-                f"must be at most {TOLERANCE:.0e}, or rounding errors"
-            )
+            wrong = f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e}"
+            raise RuntimeError(f"{wrong}; must be at most {TOLERANCE:.0e}, or rounding errors")
         record: dict[str, Any] = {
             **self.measure_times(model, deployed.onnx),
             **latency.measure_size(model, network, deployed.onnx),
@@ -89,10 +85,8 @@ class Deployment:
             times = latency.measure_step_times(path, self.latency_steps)
             record[self.precision] = {**cost, **times, "onnx_bytes": path.stat().st_size}
         elif self.precision != "fp32":
-            announce(
-                f"export.precision={self.precision}: skipped; "
-                f"{type(model).__name__} does not have a streaming graph"
-            )
+            reason = f"{type(model).__name__} does not have a streaming graph"
+            announce(f"export.precision={self.precision}: skipped; {reason}")
         return record
 
     def measure_times(self, model: MotionModel, path: Path) -> dict[str, float]:

@@ -47,8 +47,8 @@ def measure_step_times(path: Path, steps: int = 200) -> dict[str, Any]:
             ours.append(middle - start)
             theirs.append(time.perf_counter() - middle)
     return {
-        **_summarize_times("", ours),
-        **_summarize_times("yardstick_", theirs),
+        **summarize_times("", ours),
+        **summarize_times("yardstick_", theirs),
         "ratio_to_yardstick": float(np.median(ours) / np.median(theirs)),
         "core_share": clock.fraction,
         "steps": len(ours),
@@ -131,7 +131,7 @@ def make_yardstick() -> onnx.ModelProto:
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
 
 
-def _summarize_times(prefix: str, seconds: list[float]) -> dict[str, float]:
+def summarize_times(prefix: str, seconds: Sequence[float] | np.ndarray) -> dict[str, float]:
     return {
         f"{prefix}median_ms": 1000 * float(np.median(seconds)),
         f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),

@@ -140,9 +140,8 @@ def _quantise_to_int8(
 
 def _check_quantised(model: ModelProto, inner: Collection[str]) -> None:
     """Raise RuntimeError if a layer kept its weight in float32; ONNX Runtime may skip layers silently."""
-    quantised = {
-        name for node in model.graph.node if node.op_type == "DequantizeLinear" for name in node.output
-    }
+    scaled = (node for node in model.graph.node if node.op_type == "DequantizeLinear")
+    quantised = {name for node in scaled for name in node.output}
     layers = {node.name: node.input[1] for node in model.graph.node if node.name in inner}
     if skipped := [name for name in inner if layers.get(name) not in quantised]:
         count = f"{len(skipped)} of {len(inner)} layers"
@@ -247,8 +246,7 @@ def compare_accuracy(
     - "default": whether the file in lower precision may be the default (`is_accurate_enough`).
     """
     before, after = (measure_accuracy(path, normalizer, clips) for path in (exact, other))
-    rotation, position, jitter = (
-        after[name] / before[name] - 1 for name in ("MPJPE", "position MPJPE", "Jitter")
-    )
+    names = "MPJPE", "position MPJPE", "Jitter"
+    rotation, position, jitter = (after[name] / before[name] - 1 for name in names)
     grown = {"growth": float(np.maximum(rotation, position)), "jitter_growth": jitter}  # NaN if either is
     return {"fp32": before, precision: after, **grown, "default": is_accurate_enough(grown)}

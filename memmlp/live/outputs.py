@@ -190,8 +190,7 @@ def compute_euler_angles(rotations: np.ndarray) -> np.ndarray:
     """Return Unity's Euler angles (n, 3) about X, Y and Z, degrees. Ry Rx Rz equals rotations (n, 3, 3)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # warns about gimbal lock, where one angle is arbitrary
-        angles: np.ndarray = Rotation.from_matrix(rotations).as_euler("YXZ", degrees=True)[:, [1, 0, 2]]
-    return angles
+        return Rotation.from_matrix(rotations).as_euler("YXZ", degrees=True)[:, [1, 0, 2]]
 
 
 class Recorder:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from memmlp.common.processes import CoreUsageTimer
-from memmlp.deploy.latency import WARM_UP
+from memmlp.deploy.latency import WARM_UP, summarize_times
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
 
@@ -20,11 +20,7 @@ def measure_pose_times(path: Path, steps: int) -> dict[str, float]:
     caches. `pose_core_share` is the fraction of the time in which the thread ran on a core."""
     stream, clock = Stream(path), CoreUsageTimer()
     seconds = time_poses(stream, WARM_UP + max(steps, LEAST))[WARM_UP:]
-    return {
-        "pose_median_ms": 1000 * float(np.median(seconds)),
-        "pose_p95_ms": 1000 * float(np.percentile(seconds, 95)),
-        "pose_core_share": clock.fraction,
-    }
+    return summarize_times("pose_", seconds) | {"pose_core_share": clock.fraction}
 
 
 def time_poses(stream: Stream, count: int) -> np.ndarray:

@@ -37,8 +37,7 @@ def find_lost(poses: np.ndarray, still: np.ndarray | float = 0.0) -> np.ndarray:
     tracker without a pose, as NaN, far away, at the exact origin, without a rotation, or with its last pose
     repeated. `isLost` in the web page's stream.js follows the same rules."""
     has_pose = (np.abs(poses) <= FARTHEST).all(1) & poses[:, :3].any(1) & poses[:, 3:].any(1)
-    lost: np.ndarray = ~has_pose | (np.asarray(still) > FROZEN)
-    return lost
+    return ~has_pose | (np.asarray(still) > FROZEN)
 
 
 class TrackerReader:
@@ -167,10 +166,9 @@ class OddSamples:
         odd_kinds: dict[str, bool] = {}
         if not lost[0]:
             head, *hands = positions.tolist()
-            near = (
-                gone or math.dist(head, hand) <= REACH for hand, gone in zip(hands, lost[1:], strict=True)
-            )
-            odd_kinds |= {"far": not all(near), "high": head[2] > HIGHEST}
+            seen = (hand for hand, gone in zip(hands, lost[1:], strict=True) if not gone)
+            is_far = any(not math.dist(head, hand) <= REACH for hand in seen)
+            odd_kinds |= {"far": is_far, "high": head[2] > HIGHEST}
         if time is not None:
             later = math.inf if self.last is None else time - self.last
             self.last, single = time, np.float32(time)

@@ -75,8 +75,7 @@ class Offsets(NamedTuple):
     @property
     def distances(self) -> np.ndarray:
         """The distance of each device from its joint (3,), metres."""
-        distances: np.ndarray = np.linalg.norm(self.positions, axis=1)
-        return distances
+        return np.linalg.norm(self.positions, axis=1)
 
     @property
     def tilt_warning(self) -> str | None:
@@ -84,10 +83,8 @@ class Offsets(NamedTuple):
         tilt = float(np.arccos(np.clip(self.rotations[0, 1, 1], -1, 1)))  # Y is up in every space's body axes
         if tilt <= TILTED:
             return None
-        return (
-            f"the head's device is {np.degrees(tilt):.0f} degrees from upright; "
-            "check that quaternions are xyzw, and check `space`"
-        )
+        wrong = f"the head's device is {np.degrees(tilt):.0f} degrees from upright"
+        return f"{wrong}; check that quaternions are xyzw, and check `space`"
 
 
 def check_offsets(offsets: Offsets) -> Offsets:

@@ -138,10 +138,10 @@ def check_imported_body(clips: Iterable[Path], rest: np.ndarray, body_source: st
             continue  # written by another program
         # Networks have their joints in float32.
         if joints.shape != rest.shape or not np.allclose(joints, rest, rtol=0, atol=1e-4):
-            raise InputError(
-                f"{path.parent}: the clips were imported for the body {body}, but {body_source} is "
-                "different; use the same body, or import the clips again with --body"
+            wrong = (
+                f"{path.parent}: the clips were imported for the body {body}, but {body_source} is different"
             )
+            raise InputError(f"{wrong}; use the same body, or import the clips again with --body")
 
 
 _RADII = {

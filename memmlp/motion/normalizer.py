@@ -95,9 +95,8 @@ class Normalizer(nn.Module):
 
     def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert motion (..., 198) in network space with the given origin to the world (..., 198)."""
-        return self.coordinates.convert_motion_to_world(
-            (motion * self.std[SPARSE_DIM:]).add_(self.mean[SPARSE_DIM:]), origin
-        )
+        local = (motion * self.std[SPARSE_DIM:]).add_(self.mean[SPARSE_DIM:])
+        return self.coordinates.convert_motion_to_world(local, origin)
 
     def convert_rotations_to_world(self, rotations: Tensor, origin: Tensor) -> Tensor:
         """Convert joints' global rotations (..., 6 n), 6D, from local coordinates to the world."""

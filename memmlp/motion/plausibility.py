@@ -103,9 +103,8 @@ def _find_jumps(clip: Clip) -> Iterator[str]:
     """Yield descriptions of the largest jump between two frames and of the longest constant trans or pose."""
     if len(clip) < AROUND:
         return
-    pieces = [
-        np.arange(start, min(start + PIECE, len(clip) - 1) + 1) for start in range(0, len(clip) - 1, PIECE)
-    ]
+    last, starts = len(clip) - 1, range(0, len(clip) - 1, PIECE)
+    pieces = (np.arange(start, min(start + PIECE, last) + 1) for start in starts)
     positions = (_compute_positions(clip, piece) for piece in pieces)
     steps = np.concatenate([np.linalg.norm(np.diff(at, axis=0), axis=-1).mean(1) for at in positions])
     ratio = steps / (median_filter(steps, AROUND, mode="nearest") + SLOWEST / clip.fps)

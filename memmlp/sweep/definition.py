@@ -118,10 +118,8 @@ class Sweep:
                 continue
             others.append(text)
             if key in setters:
-                raise InputError(
-                    f"{text}: variant '{setters[key]}' of sweep {self.name} already sets {key}; "
-                    "expected a key that no variant sets"
-                )
+                wrong = f"{text}: variant '{setters[key]}' of sweep {self.name} already sets {key}"
+                raise InputError(f"{wrong}; expected a key that no variant sets")
         return replace(self, command_line=(*self.command_line, *others), seeds=seeds)
 
     def merge_overrides(self, variant: Variant) -> tuple[str, ...]:
@@ -138,9 +136,8 @@ class Sweep:
         for an unknown label, or a row with only the paper's values."""
         labels = [variant.label for variant in self.list_runnable()]
         if missing := [name for name in names if name not in labels]:
-            raise InputError(
-                f"sweep {self.name}: no variant '{missing[0]}' can be run; expected {', '.join(labels)}"
-            )
+            wrong = f"sweep {self.name}: no variant '{missing[0]}' can be run"
+            raise InputError(f"{wrong}; expected {', '.join(labels)}")
         return tuple(names) or tuple(labels)
 
     def list_variant_seeds(self) -> list[VariantSeed]:
@@ -187,9 +184,8 @@ def load_sweep_copy(folder: Path) -> Sweep | None:
         return None
     try:
         content = json.loads(path.read_bytes())
-        content["variants"] = [
-            Variant(**_with_tuples(fields, "overrides", "seeds", "cell")) for fields in content["variants"]
-        ]
+        variants = (_with_tuples(fields, "overrides", "seeds", "cell") for fields in content["variants"])
+        content["variants"] = [Variant(**fields) for fields in variants]
         names = ("notes", "base", "seeds", "variants", "metrics", "command_line")
         return Sweep(**_with_tuples(content, *names))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -100,9 +100,9 @@ class Plan:
         """Return the state of each task's run by the task's key; "blocked" if a prerequisite run is FAULTY.
         Tasks that were done in the states `before` are not read again."""
         done = {key: state for key, state in (before or {}).items() if state == "done"}
-        return self.mark_blocked(
-            {t.key: done.get(t.key) or self.get_run(t).state(self.is_complete(t)) for t in self.tasks}
-        )
+        tasks = self.tasks
+        states = {t.key: done.get(t.key) or self.get_run(t).state(self.is_complete(t)) for t in tasks}
+        return self.mark_blocked(states)
 
     def mark_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
         """Return the states, with "blocked" for each task after a failed prerequisite."""

@@ -83,9 +83,8 @@ class Board(Screen):
 
     def update(self, plan: Plan, states: Mapping[str, str]) -> None:
         done = f"{sum(state == 'done' for state in states.values())} of {len(states)} done"
-        changed = [
-            task for task in plan.tasks if self.before and self.before.get(task.key) != states[task.key]
-        ]
+        before = self.before or states
+        changed = [task for task in plan.tasks if before.get(task.key) != states[task.key]]
         changes = [_describe_change(plan, task, states[task.key]) for task in changed]
 
         def describe_running() -> list[str]:
@@ -130,9 +129,8 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     for seed in seeds:
         table.add_column(f"seed {seed}")
     for label in labels:
-        cells = {
-            e.seed: format_state(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label
-        }
+        entries = [entry for entry in plan.entries if entry.label == label]
+        cells = {e.seed: format_state(plan, tasks[e.key], states[e.key]) for e in entries}
         table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
     below = [
         Text(f"{describe_task(plan, task)}: ") + format_state(plan, task, states[task.key])
@@ -142,9 +140,8 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     counts = Counter(STATE_NAMES.get(state, state).partition(",")[0] for state in states.values())
     below.append(Text(", ".join(f"{count} {state}" for state, count in counts.items())))
     if any(states[task.key] == "done" and format_result(plan.get_run(task)) for task in plan.tasks):
-        below.append(
-            Text("cm: done; MPJPE of the rotation branch in stream mode (tables may show other branches)")
-        )
+        legend = "cm: done; MPJPE of the rotation branch in stream mode (tables may show other branches)"
+        below.append(Text(legend))
     below += [
         Text(f"{describe_task(plan, task)}: {plan.get_run(task).fault}", style="red")
         for task in plan.tasks

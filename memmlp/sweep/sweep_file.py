@@ -49,10 +49,8 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
     other keys are checked, because they may name custom metrics. Raises InputError for invalid content."""
     name = path.stem
     if not name.isprintable() or not name.strip(". ") or len(name.encode()) > MAX_NAME_BYTES:
-        raise InputError(
-            f"{path.parent}: the name {name!r} must be printable, not only dots, and at "
-            f"most {MAX_NAME_BYTES} bytes long; rename the sweep file"
-        )
+        expected = f"must be printable, not only dots, and at most {MAX_NAME_BYTES} bytes long"
+        raise InputError(f"{path.parent}: the name {name!r} {expected}; rename the sweep file")
     try:
         content = parse_config_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -113,10 +111,8 @@ def parse_sweep(name: str, content: Any) -> Sweep:
 
 
 def _parse_variants(value: Any, branch: str) -> list[Variant]:
-    variants = [
-        _parse_variant(str(label), fields, branch)
-        for label, fields in _parse_mapping(value, "variants").items()
-    ]
+    named = _parse_mapping(value, "variants").items()
+    variants = [_parse_variant(str(label), fields, branch) for label, fields in named]
     if len({variant.label for variant in variants}) < len(variants):
         raise InputError("variants: two variants have the same label")
     for variant in variants:

@@ -106,9 +106,8 @@ def _find_keys(path: Path, names: set[str]) -> tuple[dict[str, tuple[int, ...]],
 def _parse_rate(path: Path, value: np.ndarray) -> float:
     """Parse the rate from an array with one float, int, bytes or text element."""
     if value.size != 1 or value.dtype.kind not in "fiuSU":
-        raise InputError(
-            f"{path}: the frame rate has type {value.dtype}, shape {value.shape}; must be a number"
-        )
+        found = f"{path}: the frame rate has type {value.dtype}, shape {value.shape}"
+        raise InputError(f"{found}; must be a number")
     try:
         item = value.item()
         fps = float(item.decode() if isinstance(item, bytes) else item)
@@ -125,9 +124,8 @@ def _read_array(path: Path, file: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
     assert file.zip is not None  # it is open
     info = file.zip.getinfo(f"{key}.npy")
     if info.compress_type not in METHODS:
-        raise InputError(
-            f"{path}: {key} has compression method {info.compress_type}; must be stored or deflate"
-        )
+        found = f"{path}: {key} has compression method {info.compress_type}"
+        raise InputError(f"{found}; must be stored or deflate")
     if info.file_size > MAX_BYTES:
         raise InputError(f"{path}: {key} has {info.file_size} bytes; must have at most {MAX_BYTES}")
     return file[key]

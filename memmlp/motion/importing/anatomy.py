@@ -134,10 +134,8 @@ def has_raised_arm(pose: np.ndarray) -> bool:
 
 def measure_unevenness(poses: np.ndarray) -> np.ndarray:
     """Measure how far poses (N, 22, 3) differ from a straight stance: sums of angles (N,), degrees."""
-    total = sum(
-        compute_angles(poses[:, end] - poses[:, start], along)
-        for start, end, along, _ in _list_vertical_segments()
-    )
+    vertical = _list_vertical_segments()
+    total = sum(compute_angles(poses[:, end] - poses[:, start], along) for start, end, along, _ in vertical)
     left, across = (poses[:, a] - poses[:, b] for a, b in (HIPS, SHOULDERS))
     arms = ((16, 18, 20), (17, 19, 21))
     bends = [compute_angles(poses[:, e] - poses[:, m], poses[:, m] - poses[:, s]) for s, m, e in arms]
@@ -174,9 +172,8 @@ def compute_orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarra
     hips, shoulders = (normalize_vectors(stance[left] - stance[right]) for left, right in (HIPS, SHOULDERS))
     chest = align_directions((UP, UP), (LEFT, shoulders))
     trunk = next(end for end in (*SPINE, HEAD) if is_long(0, end) and mapped[end])
-    result[0] = align_directions(
-        (rest[1] - rest[2], hips), (rest[trunk] - rest[0], stance[trunk] - stance[0])
-    )
+    up = rest[trunk] - rest[0], stance[trunk] - stance[0]
+    result[0] = align_directions((rest[1] - rest[2], hips), up)
     for step, joint in enumerate(SPINE, start=1):
         left = normalize_vectors(hips + min(step / 3, 1.0) * (shoulders - hips))
         result[joint] = align_directions((UP, UP), (LEFT, left))

@@ -85,9 +85,8 @@ def guess_map(recording: Recording, name: str) -> MapGuess:
             node_of |= {f"{side}_collar": collars[-1]} if collars else {}
     by_name = set(node_of)
     node_of |= tree.find_trunk(node_of)
-    by_name |= {
-        joint for joint in ("neck", "head") if joint in node_of and joint in tree.words[node_of[joint]].word
-    }
+    trunk = {joint: tree.words[node_of[joint]].word for joint in ("neck", "head") if joint in node_of}
+    by_name |= {joint for joint, word in trunk.items() if joint in word}
     for side in ("left", "right"):
         ankle = node_of.get(f"{side}_ankle")
         tips = [node for node, parent in enumerate(tree.parents) if parent == ankle]
@@ -118,11 +117,8 @@ class _Tree:
         node_of: dict[str, int] = {}
         for part, spellings in parts.items():
             above = next(reversed(node_of.values()), None)
-            below = [
-                node
-                for node in range(len(self.nodes))
-                if not self.is_end(node) and (above is None or above in self.list_path(node)[:-1])
-            ]
+            joints = (node for node in range(len(self.nodes)) if not self.is_end(node))
+            below = [node for node in joints if above is None or above in self.list_path(node)[:-1]]
             matches = [n for word in spellings for n in below if self.words[n] == (side, word)]
             if matches:
                 node_of[part] = matches[0]

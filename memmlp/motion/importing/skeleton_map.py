@@ -63,9 +63,8 @@ def load_skeleton(which: str) -> SkeletonMap:
     try:
         content = load_yaml(path.read_text("utf-8"), _StrictLoader)
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise InputError(
-            f"{path}: {describe_read_error(error)[:120]}; expected a readable YAML map"
-        ) from error
+        reason = describe_read_error(error)[:120]
+        raise InputError(f"{path}: {reason}; expected a readable YAML map") from error
     return _parse_map(path, content)
 
 
@@ -89,12 +88,9 @@ def find_skeleton(recording: Recording, user_map: SkeletonMap | None = None) -> 
         return fitting[0]
     problem = "fits more than one skeleton" if fitting else "has an unknown skeleton"
     names = ", ".join(skeleton.name for skeleton in fitting or maps)
-    joint_names = [name for name in recording.nodes if not name.endswith(END)]
-    joint_list = ", ".join(joint_names[:60]) + (", ..." if len(joint_names) > 60 else "")
-    raise InputError(
-        f"{recording.path}: {problem} with the joints {joint_list}; "
-        f"expected one of {names}, or a map in --skeleton"
-    )
+    joints = [name for name in recording.nodes if not name.endswith(END)]
+    found = f"{problem} with the joints {', '.join(joints[:60])}{', ...' if len(joints) > 60 else ''}"
+    raise InputError(f"{recording.path}: {found}; expected one of {names}, or a map in --skeleton")
 
 
 @cache

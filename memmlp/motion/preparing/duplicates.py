@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from memmlp.motion.body import FPS, JOINTS, SWAPPED, make_builtin_rest_joints
+from memmlp.motion.body import FPS, SWAPPED, make_builtin_rest_joints
 from memmlp.motion.clip import LINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import compute_clip_kinematics
@@ -266,11 +266,7 @@ def _has_same_rotations(one: np.ndarray, frame: int, other: np.ndarray, other_fr
     )
 
 
-BONES = [JOINTS.index("pelvis")] + [
-    JOINTS.index(f"{side}_{joint}")
-    for side in ("left", "right")
-    for joint in ("hip", "knee", "shoulder", "elbow")
-]
+BONES = [0, 1, 4, 16, 18, 2, 5, 17, 19]  # pelvis; left, then right hip, knee, shoulder and elbow
 SMOOTH = 2.0  # frames: standard deviation of the filter for angular speeds
 SLOW = 0.2  # rad/s, added to speeds before the logarithm
 APART = 15  # frames between marked frames, at least

@@ -93,9 +93,8 @@ class Coverage:
     @property
     def gap_description(self) -> str:
         present, total = self.counts
-        by_subset = (
-            f"{name} {count} of {self.entry_counts[name]}" for name, count in self.missing_counts.items()
-        )
+        missing = self.missing_counts.items()
+        by_subset = (f"{name} {count} of {self.entry_counts[name]}" for name, count in missing)
         return f"{total - present} of {total} entries of the list have no clip ({', '.join(by_subset)})"
 
     def check(self, root: Root) -> None:
@@ -134,9 +133,8 @@ class Manifest:
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
             if data["format"] != FORMAT:
-                raise InputError(
-                    f"{path}: has format {data['format']}; must be {FORMAT}; prepare the data again"
-                )
+                expected = f"must be {FORMAT}; prepare the data again"
+                raise InputError(f"{path}: has format {data['format']}; {expected}")
             data["clips"] = tuple(ClipRecord(**clip) for clip in data["clips"])
             data["skipped"] = tuple(SkippedFile(**file) for file in data["skipped"])
             data["rest_joints"] = tuple(map(tuple, data["rest_joints"]))

@@ -124,9 +124,8 @@ class GroupedSplit(Split):
         """Map clips to parts: the first groups in seeded order fill `fractions`' parts, the others train. If
         `train_fraction` is below 1, the last groups of train are left out (None). `aliases` has clip name ->
         the name for patterns and order. Raises InputError if there are fewer groups than parts."""
-        ranked = sorted(
-            self.grouping.group_clips(aliases), key=lambda group: make_sort_key(aliases[group[0]], self.seed)
-        )
+        groups = self.grouping.group_clips(aliases)
+        ranked = sorted(groups, key=lambda group: make_sort_key(aliases[group[0]], self.seed))
         parts: dict[str, str | None] = dict.fromkeys(aliases, "train")
         start = 0
         for part, count in _count_groups(len(ranked), fractions).items():

@@ -105,9 +105,8 @@ def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
 
 def _compute_content_digest(clip: Clip) -> str:
     """Return a digest of the frames in single precision. It ignores the saved type and the frame rate."""
-    numbers = np.concatenate(
-        [clip.poses.reshape(len(clip), -1), clip.trans], 1, dtype="<f4", casting="same_kind"
-    )
+    parts = [clip.poses.reshape(len(clip), -1), clip.trans]
+    numbers = np.concatenate(parts, 1, dtype="<f4", casting="same_kind")
     if (numbers == numbers[0]).all():
         return STILL
     return hashlib.sha256((numbers + np.float32(0)).tobytes()).hexdigest()  # + 0, for -0 is 0

@@ -66,9 +66,8 @@ def draw_sitting(rng: np.random.Generator, t: Array) -> Puppet:
         for side in (0, 1):
             move_hand(puppet, side, lap, make_pulse(t, start + 0.2, down + 0.2, up - 0.1, end))
             lively = rng.uniform(0.3, 1.0) * np.array([0.04, 0.1, 0.04])
-            move_hand(
-                puppet, side, lap + [0, 0.04, 0] + lively * make_wander(rng, t, (3,), high=0.8), talking
-            )
+            gesture = lap + [0, 0.04, 0] + lively * make_wander(rng, t, (3,), high=0.8)
+            move_hand(puppet, side, gesture, talking)
     return puppet
 
 
@@ -244,14 +243,13 @@ def draw_idling(rng: np.random.Generator, t: Array) -> Puppet:
     for start, _ in draw_occasions(rng, t, (1.6, 2.0), (2.0, 6.0)):
         turn = rng.uniform(-0.9, 0.9)
         first = int(turn < 0)
-        work.change_stance(
-            start, 0.5, 0.6, rng.uniform(-0.08, 0.08, 2), turn, first, lift=0.04, heel=0.3, push=0.25
-        )
+        shift = rng.uniform(-0.08, 0.08, 2)
+        work.change_stance(start, 0.5, 0.6, shift, turn, first, lift=0.04, heel=0.3, push=0.25)
     puppet = stand(rng, t, style, work)
-    shift = 0.04 * make_wander(rng, t, low=0.05, high=0.25)
-    puppet.pelvis[:, :2] += shift[:, None] * compute_direction(puppet.heading + np.pi / 2)
-    puppet.tilt[:, 2] += 0.8 * shift
-    puppet.spine[:, 2] -= 0.8 * shift
+    sway = 0.04 * make_wander(rng, t, low=0.05, high=0.25)
+    puppet.pelvis[:, :2] += sway[:, None] * compute_direction(puppet.heading + np.pi / 2)
+    puppet.tilt[:, 2] += 0.8 * sway
+    puppet.spine[:, 2] -= 0.8 * sway
     for start, end in draw_occasions(rng, t, (1.5, 4.0), (0.2, 2.0)):
         look = make_pulse(t, start, start + rng.uniform(0.5, 0.7), end - 0.7, end)
         pitch, yaw = rng.uniform([-0.5, -1.2], [0.5, 1.2])

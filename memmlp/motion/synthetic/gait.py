@@ -277,9 +277,8 @@ def _make_foot_paths(t: Array, gait: Gait, style: Style, course: Course) -> Feet
 
 
 def _make_step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike: float) -> FootStep:
-    off, on, over = np.interp(
-        [strike - 1 + gait.duty, strike, strike + gait.ahead * gait.duty], course.phase, t
-    )
+    phases = [strike - 1 + gait.duty, strike, strike + gait.ahead * gait.duty]
+    off, on, over = np.interp(phases, course.phase, t)
     frame = int(np.searchsorted(t, over).clip(0, len(t) - 1))
     pace = np.interp(0.5 * (off + on), t, course.pace) / gait.speed[1]
     effort = (0.2 + 0.8 * min(1.0, 1.4 * pace)) * style.uneven[side]

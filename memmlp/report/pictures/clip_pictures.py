@@ -251,9 +251,8 @@ def encode_gif(pictures: Iterable[np.ndarray]) -> bytes:
     shades = [(np.linspace(0.3, top, n)[:, None, None] * hue).reshape(-1, 3) for hue, n, top in hues]
     palette = Image.new("P", (1, 1))
     palette.putpalette((255 * np.clip(np.concatenate(shades), 0, 1) + 0.5).astype(np.uint8).tobytes())
-    first, *others = (
-        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
-    )
+    images, no_dither = map(Image.fromarray, pictures), Image.Dither.NONE
+    first, *others = (image.quantize(palette=palette, dither=no_dither) for image in images)
     buffer, ticks = BytesIO(), cycle(TICKS)
     durations = [next(ticks) for _ in range(1 + len(others))]
     first.save(buffer, "GIF", save_all=True, append_images=others, duration=durations, loop=0)

@@ -139,9 +139,8 @@ def _draw_floor(axes: Axes, camera: Camera, joints: np.ndarray, floor: float, ra
     fade = np.clip(0.3 * (1 - np.hypot(*(starts - [x, y]).T) / radius), 0, 1)
     heights = np.full((len(segments), 2, 1), floor)
     places = camera.project(np.concatenate([segments, heights], -1))[..., :2]
-    axes.add_collection(
-        LineCollection(list(places), colors=[(0, 0, 0, dark) for dark in fade], linewidths=0.8)
-    )
+    colours = [(0, 0, 0, dark) for dark in fade]
+    axes.add_collection(LineCollection(list(places), colors=colours, linewidths=0.8))
     feet = np.concatenate([find_limb_ends(limb, joints) for limb in LIMBS])
     spread = SHADOW + 0.25 * np.maximum(np.nan_to_num(feet[:, 2:]) - floor, 0)  # wider for higher joints
     feet[:, 2] = floor

@@ -197,9 +197,8 @@ class Slurm:
             if not name.startswith(("SLURM_", "SRUN_")) or name in KEPT_VARIABLES
         }
         try:
-            done = subprocess.run(
-                ["sbatch", str(script)], env=outside, capture_output=True, text=True, timeout=PATIENCE
-            )
+            command = ["sbatch", str(script)]
+            done = subprocess.run(command, env=outside, capture_output=True, text=True, timeout=PATIENCE)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise InputError(f"executor=slurm: sbatch: {error}") from None
         job = re.search(r"job (\d+)", done.stdout)
@@ -242,9 +241,8 @@ def format_batch_script(folder: Path, options: SlurmOptions, workers: int) -> st
     lines.append('[ -z "$SLURM_CPUS_PER_TASK" ] || export SRUN_CPUS_PER_TASK="$SLURM_CPUS_PER_TASK"')
     lines += ["trap 'scontrol requeue \"$SLURM_JOB_ID\"' USR2"] if requeues else []
     python = shlex.quote(sys.executable) if options.python is None else options.python
-    start = (
-        f"{python} -u -m memmlp.sweep.executors.local {shlex.quote(str(folder))}/$SLURM_ARRAY_TASK_ID beat"
-    )
+    place = f"{shlex.quote(str(folder))}/$SLURM_ARRAY_TASK_ID"
+    start = f"{python} -u -m memmlp.sweep.executors.local {place} beat"
     # bash handles the signal only between commands, or during `wait`, which the signal ends.
     lines += [f"{shlex.join(['srun', *options.srun])} {start} &", "wait $! || wait $!"]
     return "\n".join(lines) + "\n"

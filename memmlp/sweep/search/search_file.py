@@ -177,8 +177,7 @@ def parse_search(content: Mapping[str, Any], best: Mapping[str, Value] | None = 
     values = {**content, "name": str(content["name"])}
     optional = {"startup": values["sampler"] != "tpe", "prune_after": values["pruner"] == "none"}
     for key, rule in RULES.items():
-        allowed = (values[key] is None and optional.get(key)) or rule.allows(values[key])
-        if not allowed:
+        if not (values[key] is None and optional.get(key)) and not rule.allows(values[key]):
             raise InputError(f"search.{key}={values[key]}: must be {rule.words}")
     values["base"] = tuple(values["base"])
     values["space"] = space = tuple(_parse_ranges(values["space"], "", best or {}))
