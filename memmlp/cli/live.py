@@ -233,6 +233,7 @@ def serve(options: LiveOptions) -> None:
     from memmlp.live.session import server as page
     from memmlp.live.session.loop import Fitting, make_greeting, run_loop
     from memmlp.live.stream import Stream
+    from memmlp.motion.formats.gltf import encode_vrm
     from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
 
     with contextlib.closing(make_source(options)) as source:
@@ -243,7 +244,7 @@ def serve(options: LiveOptions) -> None:
         stream.offsets = calibration.offsets
         avatar, vrm = options.avatar, None
         if avatar is not None:
-            vrm = page.make_mannequin_vrm(stream.rest) if avatar == BUILTIN else page.read_vrm(Path(avatar))
+            vrm = encode_vrm(stream.rest) if avatar == BUILTIN else page.read_vrm(Path(avatar))
         files = page.load_page_files(vrm)
         outputs = make_outputs(options, stream)
         run = None if options.is_onnx_file else find_run(options.outputs, options.network)

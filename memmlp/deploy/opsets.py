@@ -14,14 +14,9 @@ from onnx import GraphProto, ModelProto, NodeProto, helper, numpy_helper, versio
 
 from memmlp.common.errors import InputError
 
-NATIVE = 18
-"""The opset that torch's exporter writes."""
-
-OPSETS = range(15, 27)
-"""The supported opsets. ONNX Runtime 1.31 does not read newer opsets."""
-
-WIDENED = ("Identity", "LeakyRelu", "Where")
-"""Operators with new versions that only support more number types."""
+NATIVE = 18  # the opset that torch's exporter writes
+OPSETS = range(15, 27)  # the supported opsets; ONNX Runtime 1.31 does not read newer opsets
+WIDENED = ("Identity", "LeakyRelu", "Where")  # newer versions only support more number types
 
 
 class GraphConstants:

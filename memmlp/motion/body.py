@@ -138,10 +138,9 @@ def check_imported_body(clips: Iterable[Path], rest: np.ndarray, body_source: st
             continue  # written by another program
         # Networks have their joints in float32.
         if joints.shape != rest.shape or not np.allclose(joints, rest, rtol=0, atol=1e-4):
-            wrong = (
-                f"{path.parent}: the clips were imported for the body {body}, but {body_source} is different"
-            )
-            raise InputError(f"{wrong}; use the same body, or import the clips again with --body")
+            wrong = f"the clips were imported for the body {body}, but {body_source} is different"
+            advice = "use the same body, or import the clips again with --body"
+            raise InputError(f"{path.parent}: {wrong}; {advice}")
 
 
 _RADII = {
@@ -149,8 +148,7 @@ _RADII = {
     "spine2": 0.106, "spine3": 0.108, "neck": 0.050, "collar": 0.062, "head": 0.052, "shoulder": 0.054,
     "elbow": 0.041, "wrist": 0.031,
 }  # fmt: skip
-RADII = tuple(_RADII[name.split("_")[-1]] for name in JOINTS)
-"""The body's radius at each joint, metres."""
+RADII = tuple(_RADII[name.split("_")[-1]] for name in JOINTS)  # the body's radius at each joint, metres
 
 HEAT = ("#2b5fd9", "#27a9e1", "#3fc380", "#f2d43d", "#f28c28", "#c4161c")
 """The colour scale for joint errors, from zero to the maximum, evenly spaced."""

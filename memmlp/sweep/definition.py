@@ -14,14 +14,11 @@ from memmlp.common.files import make_json_safe, read_json, write_json
 from memmlp.common.overrides import Override
 from memmlp.evaluation.metric_facts import SMALLEST
 
-SWEEP_FILE = "sweep.json"
-"""The copy of a sweep in its folder, from which its table can be shown without composing configs."""
+SWEEP_FILE = "sweep.json"  # the sweep's copy, from which its table is shown without composing configs
 MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")  # combined: after inverse kinematics
-SIZES = ("FLOPs", "MACs", "parameters", "size")
-"""The costs of a network that depend neither on its training nor on the machine."""
-TIMES = ("ms", "network ms", "pose ms", "ratio", "FPS")
-"""The costs that are derived from measured times, so repeated measurements differ slightly."""
+SIZES = ("FLOPs", "MACs", "parameters", "size")  # costs that do not depend on training or machine
+TIMES = ("ms", "network ms", "pose ms", "ratio", "FPS")  # costs from measured times, which vary slightly
 COSTS = (*SIZES, *TIMES)
 """Metrics that are costs, not errors, in GFLOP, GMAC, millions, MB, ms, multiples of the reference network's
 time, and frames per second."""

@@ -19,8 +19,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.runs.run import Run
 
-FAULTY = ("failed", "damaged", "stopped", "blocked")
-"""The states of tasks that no worker takes."""
+FAULTY = ("failed", "damaged", "stopped", "blocked")  # the states of tasks that no worker takes
 
 
 @dataclass(frozen=True)

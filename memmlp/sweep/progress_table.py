@@ -35,8 +35,7 @@ class Screen:
     """Shows changing content: in place on a terminal, otherwise as one line for each change, and lines about
     running runs at the start and after QUIET seconds without a change."""
 
-    last_line: float | None = None
-    """The time of the last printed line, by time.monotonic; None before the first line."""
+    last_line: float | None = None  # the time of the last printed line, by time.monotonic
 
     def __init__(self) -> None:
         self.console = make_console(stderr=True)

@@ -6,19 +6,15 @@ from __future__ import annotations
 import contextlib
 import json
 import struct
-import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from memmlp.common import npm
 from memmlp.common.errors import InputError, describe_read_error
 from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, find_content_type, read_page_file
-from memmlp.motion.formats.gltf import write_vrm
 
 QUEUED = 240  # maximum number of queued frames for a page; older frames are dropped
 QUIET = 2.0  # seconds without a frame before a comment keeps the connection alive
@@ -50,14 +46,6 @@ def load_page_files(vrm: bytes | None = None) -> dict[str, bytes]:
         for name, content in npm.read_package_files(package, names).items()
     }
     return files | scripts | {"index.html": page, "avatar.vrm": vrm}
-
-
-def make_mannequin_vrm(rest: np.ndarray) -> bytes:
-    """Return the built-in avatar as VRM content, with rest joints (22, 3), metres."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mannequin.vrm"
-        write_vrm(path, rest)
-        return path.read_bytes()
 
 
 def read_vrm(path: Path) -> bytes:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import memmlp
-from memmlp.common.files import atomic_file
+from memmlp.common.files import atomic_write
 from memmlp.motion.body import CHILDREN, HEAD, JOINTS, LIMBS, N_JOINTS, PARENTS, find_limb_ends
 from memmlp.motion.clip import Clip, convert_to_y_up
 
@@ -32,7 +32,8 @@ def write_gltf(path: Path, clip: Clip, rest: np.ndarray) -> None:
     bind = rest - [0, rest[:, 1].min(), 0]  # the lowest joint on the floor
     figure = build_skinned_figure(buffer, bind, [build_mannequin(bind)])
     content = {"materials": [make_material("mannequin", COLOUR, 0.7)]}
-    write_glb(path, {**figure, **content, "animations": [_build_animation(buffer, clip, rest)]}, buffer)
+    content |= {"animations": [_build_animation(buffer, clip, rest)]}
+    atomic_write(path, encode_glb({**figure, **content}, buffer))
 
 
 def make_material(name: str, colour: tuple[float, float, float, float], roughness: float) -> dict[str, Any]:
@@ -184,18 +185,16 @@ def build_capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end
     return Mesh(positions.reshape(-1, 3), normals.reshape(-1, 3), joints, triangles)
 
 
-def write_glb(path: Path, content: dict[str, Any], buffer: Buffer) -> None:
-    """Write a .glb file atomically: a header, a chunk of JSON `content`, to which the buffer's entries are
-    added, and a binary chunk."""
+def encode_glb(content: dict[str, Any], buffer: Buffer) -> bytes:
+    """Return a .glb file: a header, a chunk of JSON `content`, to which the buffer's entries are added, and a
+    binary chunk."""
     size = len(buffer.data)
     buffers = {"accessors": buffer.accessors, "bufferViews": buffer.views, "buffers": [{"byteLength": size}]}
     encoded = json.dumps(content | buffers, separators=(",", ":"), allow_nan=False).encode()
     encoded += b" " * (-len(encoded) % 4)
-    with atomic_file(path) as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(encoded) + size))
-        file.write(struct.pack("<I4s", len(encoded), b"JSON") + encoded)
-        file.write(struct.pack("<I4s", size, b"BIN\0"))
-        file.write(buffer.data)
+    header = struct.pack("<4sII", b"glTF", 2, 28 + len(encoded) + size)
+    chunk = struct.pack("<I4s", len(encoded), b"JSON") + encoded
+    return b"".join([header, chunk, struct.pack("<I4s", size, b"BIN\0"), buffer.data])
 
 
 # VRM 1.0 (vrm-consortium/vrm-specification, VRMC_vrm-1.0): a glTF file with the 22 joints as humanoid bones
@@ -207,8 +206,7 @@ UNITY_BONES = (
 )  # fmt: skip
 """Each joint's bone in Unity's HumanBodyBones."""
 
-VRM_BONES = tuple(name[0].lower() + name[1:] for name in UNITY_BONES)
-"""Each joint's bone in VRM 1.0."""
+VRM_BONES = tuple(name[0].lower() + name[1:] for name in UNITY_BONES)  # each joint's bone in VRM 1.0
 
 LOOKS = (("body", (0.30, 0.42, 0.56, 1.0), 0.7), ("eyes", (0.012, 0.016, 0.022, 1.0), 0.25))
 """Name of the material, its linear RGB and opacity, and its roughness."""
@@ -234,9 +232,9 @@ META = {
 }
 
 
-def write_vrm(path: Path, rest: np.ndarray) -> None:
-    """Write a mannequin as a VRM 1.0 avatar (.vrm), atomically, for a body with rest joints (22, 3), metres.
-    Its licence is CC0. It stands in T-pose on the floor and faces +Z."""
+def encode_vrm(rest: np.ndarray) -> bytes:
+    """Return a mannequin as a VRM 1.0 avatar (.vrm), for a body with rest joints (22, 3), metres. Its licence
+    is CC0. It stands in T-pose on the floor and faces +Z."""
     buffer = Buffer()
     bind = rest - [0, rest[:, 1].min(), 0]
     figure = build_skinned_figure(buffer, bind, [build_mannequin(bind), build_eyes(bind)])
@@ -245,7 +243,7 @@ def write_vrm(path: Path, rest: np.ndarray) -> None:
         "extensionsUsed": ["VRMC_vrm"],
         "extensions": {"VRMC_vrm": {"specVersion": "1.0", "meta": META, "humanoid": humanoid}},
     }
-    write_glb(path, {**figure, **extension, "materials": [make_material(*look) for look in LOOKS]}, buffer)
+    return encode_glb({**figure, **extension, "materials": [make_material(*look) for look in LOOKS]}, buffer)
 
 
 def build_eyes(bind: np.ndarray) -> Mesh:

@@ -76,9 +76,7 @@ def find_rate(recording: Recording, relative: Path, user_rates: Mapping[str, flo
         for path in sorted(folder.glob(INDEX)):
             if (rate := _read_index(path).get(recording.path.stem)) is not None:
                 return Rate(rate, f"the rate in {path.name}")
-    if recording.fps is None:
-        return DATABASES
-    return Rate(recording.fps, HEADER)
+    return DATABASES if recording.fps is None else Rate(recording.fps, HEADER)
 
 
 def make_folder_key(folder: Path) -> str:

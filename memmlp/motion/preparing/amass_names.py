@@ -30,15 +30,13 @@ def normalize_subset(name: str) -> str:
     return RENAMED.get(top, top)
 
 
+# The subsets of the protocols S1, with published lists, and S2
 S1 = ("CMU", "BioMotionLab_NTroje", "MPI_HDM05")
-"""Protocol S1: the subsets with published lists."""
-
 S2_TRAIN = (
     "CMU", "MPI_Limits", "TotalCapture", "Eyes_Japan_Dataset", "KIT", "BioMotionLab_NTroje", "BMLmovi",
     "EKUT", "ACCAD", "MPI_mosh", "SFU", "MPI_HDM05",
 )  # fmt: skip
 S2_TEST = ("HumanEva", "Transitions_mocap")
-"""Protocol S2: the training subsets and the test subsets."""
 
 FOLDERS = frozenset((
     *S2_TRAIN, *S2_TEST, "PosePrior", "EyesJapanDataset", "BMLrub", "MoSh", "HDM05", "Transitions",

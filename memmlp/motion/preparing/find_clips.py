@@ -44,8 +44,7 @@ class NamedFolders:
         return NamedFolders({name: path.resolve() for name, path in self.sources.items()})
 
 
-Root = Path | NamedFolders
-"""The location of clips: one folder or several."""
+Root = Path | NamedFolders  # the location of clips: one folder or several
 
 
 @dataclass

@@ -86,9 +86,6 @@ class PersonSplit(Split):
         persons = [(name, person) for name, kind in self.kinds.items() for person in kind.persons]
         return tuple(f"{name}/{person}" for name, person in persons if person not in present)
 
-    def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
-        """Do nothing, because this split has no column file."""
-
     def describe(self) -> dict[str, Any]:
         kinds = {name: asdict(kind) for name, kind in self.kinds.items()}
         return {"kind": "persons", "seed": self.seed, "persons": [*self.persons.items()], "kinds": kinds}

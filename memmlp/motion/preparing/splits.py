@@ -63,8 +63,7 @@ class Split:
         raise NotImplementedError
 
     def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
-        """Check that the column files fit the clips to split and all files (see `Grouping.check`)."""
-        raise NotImplementedError
+        """Check that column files, if any, fit the clips to split and all files (see `Grouping.check`)."""
 
     def limit_group_sizes(
         self, parts: Mapping[str, str | None], groups: Mapping[str, str]

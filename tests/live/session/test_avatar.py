@@ -14,11 +14,12 @@ from wearer import body_frame
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 from memmlp.live.session.loop import convert_to_millimetres, make_avatar_message, make_greeting
-from memmlp.live.session.server import Hub, LiveServer, load_page_files, make_mannequin_vrm
+from memmlp.live.session.server import Hub, LiveServer, load_page_files
 from memmlp.live.session.sources import ClipSource
 from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.formats.gltf import VRM_BONES as VRM
+from memmlp.motion.formats.gltf import encode_vrm
 
 REST = make_builtin_rest_joints()
 RANDOM = np.random.default_rng(2)
@@ -57,7 +58,7 @@ def of_vrm_0(content: dict[str, Any]) -> None:
 
 @pytest.fixture(scope="module")
 def own() -> bytes:
-    vrm = make_mannequin_vrm(REST)
+    vrm = encode_vrm(REST)
     try:
         load_page_files(vrm)
     except InputError as error:

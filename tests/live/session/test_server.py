@@ -12,9 +12,10 @@ from processes import PATIENCE
 
 from memmlp.common.errors import InputError
 from memmlp.live.session.loop import make_greeting
-from memmlp.live.session.server import QUEUED, Hub, LiveServer, load_page_files, make_mannequin_vrm, read_vrm
+from memmlp.live.session.server import QUEUED, Hub, LiveServer, load_page_files, read_vrm
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.motion.body import make_builtin_rest_joints
+from memmlp.motion.formats.gltf import encode_vrm
 
 
 @pytest.fixture
@@ -115,7 +116,7 @@ def vrm(content: object) -> bytes:
 
 
 def test_files_without_an_avatar_are_rejected(tmp_path: Path):
-    mannequin = make_mannequin_vrm(make_builtin_rest_joints())
+    mannequin = encode_vrm(make_builtin_rest_joints())
     for name, content in (("own", mannequin), ("old", vrm({"extensions": {"VRM": {}}}))):
         (tmp_path / name).write_bytes(content)
         assert read_vrm(tmp_path / name) == content

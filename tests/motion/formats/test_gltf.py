@@ -8,7 +8,7 @@ from glb import Glb
 
 from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats.gltf import UNITY_BONES, write_gltf, write_vrm
+from memmlp.motion.formats.gltf import UNITY_BONES, encode_vrm, write_gltf
 from memmlp.motion.geometry import compute_clip_kinematics
 
 REST = make_builtin_rest_joints()
@@ -79,7 +79,7 @@ REQUIRED = {
 
 
 def test_the_avatar_is_a_humanoid_of_22_bones_that_anybody_may_use(tmp_path: Path):
-    write_vrm(tmp_path / "mannequin.vrm", REST)
+    (tmp_path / "mannequin.vrm").write_bytes(encode_vrm(REST))
     avatar = Glb(tmp_path / "mannequin.vrm")
     extension = avatar.json["extensions"]["VRMC_vrm"]
     assert (avatar.json["extensionsUsed"], extension["specVersion"]) == (["VRMC_vrm"], "1.0")
