@@ -102,13 +102,11 @@ def _count_lstm_flops(
     return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
 
 
-CPU_FORMULAS = {
-    torch.ops.aten.mkldnn_rnn_layer: shape_wrapper(_count_lstm_flops),
-    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: flop_registry[
-        torch.ops.aten._scaled_dot_product_flash_attention
-    ],
+aten = torch.ops.aten
+CPU_FORMULAS = {  # of CPU kernels that torch counts as 0
+    aten.mkldnn_rnn_layer: shape_wrapper(_count_lstm_flops),
+    aten._scaled_dot_product_flash_attention_for_cpu: flop_registry[aten._scaled_dot_product_flash_attention],
 }
-"""FLOP formulas of CPU kernels that torch counts as 0."""
 
 
 def make_yardstick() -> onnx.ModelProto:

@@ -238,13 +238,9 @@ def compare_accuracy(
     exact: Path, other: Path, precision: str, normalizer: Normalizer, clips: Sequence[Tensor]
 ) -> dict[str, Any]:
     """Measure the loss of accuracy from lower precision on test clips (N, 252). `exact` is the float32 file,
-    `other` that of the same network in the given precision, such as "int8".
-
-    - "fp32" and the precision's name: the metrics of both files.
-    - "growth": the relative growth of MPJPE, for the branch with the larger growth.
-    - "jitter_growth": the relative growth of Jitter.
-    - "default": whether the file in lower precision may be the default (`is_accurate_enough`).
-    """
+    `other` that of the same network in the given precision, such as "int8". Return the metrics of both files;
+    the relative growth of MPJPE, for the branch with the larger growth, and of Jitter; and whether the file
+    in lower precision may be the default (`is_accurate_enough`)."""
     before, after = (measure_accuracy(path, normalizer, clips) for path in (exact, other))
     names = "MPJPE", "position MPJPE", "Jitter"
     rotation, position, jitter = (after[name] / before[name] - 1 for name in names)

@@ -65,14 +65,10 @@ def measure_differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
 
 
 def are_rounding_errors(apart: Tensor) -> bool:
-    """Return whether the differences (N,) between torch and ONNX Runtime are rounding errors.
-
-    They are if all are at most TOLERANCE, or if their median is at most ROUNDING. Some frames can differ more
-    for these reasons:
-    - A rotation is ill-conditioned, such as the swivel of a straight leg.
-    - A network has many consecutive steps (a diffusion).
-    - A latent has the same distance to two code-vectors, and rounding decides between them.
-    """
+    """Return whether the differences (N,) between torch and ONNX Runtime are rounding errors: all are at most
+    TOLERANCE, or their median is at most ROUNDING. Some frames can differ more, because a rotation is
+    ill-conditioned, such as the swivel of a straight leg; a network has many consecutive steps (a diffusion);
+    or a latent has the same distance to two code-vectors, and rounding decides between them."""
     return bool(apart.max() <= TOLERANCE or apart.median() <= ROUNDING)
 
 

@@ -4,16 +4,14 @@ The rules apply in this order:
 
 - **Lost trackers** are held. A lost hand keeps its last pose relative to the head: it moves with the head and
   turns with the head's heading. A lost head keeps its last pose. A tracker without a sample gets its pose
-  from a T-pose under the head. Without a sample of the head, this T-pose stands at the origin. When a tracker
-  returns, it moves to its true pose over `RECOVERY` seconds. A jump would look like a fast movement to the
-  network.
+  from a T-pose under the head, or at the origin without a sample of the head. When a tracker returns, it
+  moves to its true pose over `RECOVERY` seconds. A jump would look like a fast movement to the network.
 - **Frames** have a constant distance of 1 / fps, starting at the first sample. A frame is computed when a
   sample at or after its time arrives. It is interpolated between the neighbouring samples (positions
   linearly, rotations by slerp). There is no look-ahead, and a pose is at most one frame older than the newest
   sample. Because times are rounded, a frame may also be up to `EARLY` seconds after its sample. Then it is
-  extrapolated up to `FURTHEST`. A sample of a slow tracker can give several frames. A sample of a fast
-  tracker can give no frame. The rate may change at any time.
-- **Old samples** are ignored. A sample is old if it is not newer than the previous sample.
+  extrapolated up to `FURTHEST`. A sample can give no frame or several frames; the rate may change.
+- **Old samples**, not newer than the previous sample, are ignored.
 - **Gaps** restart everything. A gap is more than `GAP` seconds without a sample, or a clock that jumps back
   by more than `GAP` seconds.
 """
@@ -25,7 +23,6 @@ import numpy as np
 from memmlp.live.rotations import BodyTree, rotate_by_fraction, slerp
 from memmlp.motion.body import (
     SPARSE_ANGULAR_VELOCITY,
-    SPARSE_DIM,
     SPARSE_POSITION,
     SPARSE_ROTATION,
     SPARSE_VELOCITY,
@@ -198,6 +195,3 @@ class FeatureWriter:
         sparse[SPARSE_POSITION] = positions.reshape(-1)
         sparse[SPARSE_VELOCITY] = (positions - last.positions).reshape(-1)
         self.last = frame
-
-
-assert SPARSE_VELOCITY.stop == SPARSE_DIM

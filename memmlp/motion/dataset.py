@@ -151,8 +151,6 @@ def _map_array(path: Path) -> Tensor:
 
 SIXD_SIGNS = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # the first two columns of S R S with S = diag(-1, 1, 1)
 POINT_SIGNS = (-1.0, 1.0, 1.0)  # S p
-
-
 TRACKED_SWAPPED = tuple(TRACKED.index(SWAPPED[joint]) for joint in TRACKED)
 
 

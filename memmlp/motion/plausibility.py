@@ -64,7 +64,7 @@ def explain_implausibility(clip: Clip) -> str | None:
 
 def find_faults(clip: Clip) -> Iterator[str]:
     """Yield the likely mistakes in a plausible clip, one sentence each."""
-    joints = _compute_positions(clip, _spread_frames(clip))
+    joints = _compute_positions(clip, _spread_frames(len(clip)))
     if (joints[:, HEAD, 2] - joints[:, 0, 2] > 0.2).mean() < 0.02:
         yield "the head is never above the pelvis, so the person lies throughout, or Z is not up"
     low, high = RATES
@@ -76,7 +76,7 @@ def find_faults(clip: Clip) -> Iterator[str]:
     if len(clip) > 1 and np.ptp(clip.poses[:, 1:], axis=0).max() <= STIFF:
         yield "only the root turns, so this is a calibration pose, or the poses are lost"
     # On SMPL's body knees bend about +X, the left elbow about -Y, and the right one about +Y.
-    poses = clip.poses[_spread_frames(clip)]
+    poses = clip.poses[_spread_frames(len(clip))]
     left, right = poses[:, ELBOWS, 1].T
     for name, bent in (("knees", poses[:, KNEES, 0]), ("elbows", (right - left) / 2)):
         if np.median(bent) < -BACKWARDS:
@@ -128,7 +128,7 @@ def _is_y_up(clip: Clip) -> bool:
     """Return whether the person stands along Y, and never along Z. A person who lies with the head towards +Y
     looks similar, but rarely has the feet at y = 0, and does not rise by a metre while the feet stay in one
     plane."""
-    joints = _compute_positions(clip, _spread_frames(clip))
+    joints = _compute_positions(clip, _spread_frames(len(clip)))
 
     def measure_standing(axis: int) -> float:
         """Return the fraction of frames in which the person stands upright along an axis."""
@@ -143,15 +143,14 @@ def _is_y_up(clip: Clip) -> bool:
 
 def _has_resting_joint(clip: Clip) -> bool:
     """Return whether some joint is slower than half the pelvis' speed in half of the frames with motion."""
-    frames = _spread_frames(clip, len(clip) - 1)
+    frames = _spread_frames(len(clip) - 1)
     moved = np.linalg.norm(_compute_positions(clip, frames + 1) - _compute_positions(clip, frames), axis=-1)
     moving = moved[:, 0] * clip.fps > 0.01
     return bool(moving.any() and np.median(moved[moving].min(1) / moved[moving, 0]) < 0.5)
 
 
-def _spread_frames(clip: Clip, last: int | None = None) -> np.ndarray:
-    last = len(clip) if last is None else last
-    return np.arange(last)[:: max(1, -(-last // SAMPLES))]
+def _spread_frames(count: int) -> np.ndarray:
+    return np.arange(count)[:: max(1, -(-count // SAMPLES))]
 
 
 def _compute_positions(clip: Clip, frames: np.ndarray) -> np.ndarray:

@@ -54,10 +54,9 @@ class Buffer:
         """Append an array (N, ...) with a type in `COMPONENTS`, and return the index of its accessor. `kind`
         is SCALAR, VEC3, VEC4 or MAT4; `target` is VERTICES or INDICES, for a mesh. glTF requires `bounds`
         (minimum and maximum) for times and positions."""
-        accessor: dict[str, Any] = {
-            "bufferView": len(self.views), "componentType": COMPONENTS[array.dtype.str],
-            "count": len(array), "type": kind,
-        }  # fmt: skip
+        view_index, component = len(self.views), COMPONENTS[array.dtype.str]
+        accessor: dict[str, Any] = {"bufferView": view_index, "componentType": component}
+        accessor |= {"count": len(array), "type": kind}
         if bounds:
             rows = array.reshape(len(array), -1)
             accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}

@@ -162,10 +162,9 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
     standing = [int(frame) for frame in order if anatomy.find_stance_fault(positions[frame]) is None]
     if not standing:
         best = anatomy.find_stance_fault(positions[order[0]])
-        raise InputError(
-            f"{path}: the person stands neither in the zero pose ({why}) nor in a frame (best: {best}); "
-            "check the keys up: and joints: of the map, or add its key rest:"
-        )
+        wrong = f"the person stands neither in the zero pose ({why}) nor in a frame (best: {best})"
+        advice = "check the keys up: and joints: of the map, or add its key rest:"
+        raise InputError(f"{path}: {wrong}; {advice}")
     sound = (frame for frame in standing if anatomy.find_side_fault(positions[frame], motion.mapped) is None)
     frame = next(sound, standing[0])
     nodes = recording.compute_kinematics()[1][frame + int(skeleton.calibration_frame)]
@@ -312,12 +311,11 @@ def find_unit_and_up(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap
 def _find_unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
     """Return the file's unit in metres, given the length of the legs in the file's unit."""
     if skeleton.unit is not None:
-        low, high = GIVEN_LEG
-        if not low <= leg * skeleton.unit <= high:
-            raise InputError(
-                f"{recording.path}: with unit={skeleton.unit:g} in skeleton {skeleton.name}, the legs are "
-                f"{leg * skeleton.unit:.3g} m long; must be {low:g} to {high:g} m"
-            )
+        (low, high), metres = GIVEN_LEG, leg * skeleton.unit
+        if not low <= metres <= high:
+            given = f"with unit={skeleton.unit:g} in skeleton {skeleton.name}"
+            wrong = f"the legs are {metres:.3g} m long; must be {low:g} to {high:g} m"
+            raise InputError(f"{recording.path}: {given}, {wrong}")
         return skeleton.unit
     fitting = [unit for unit in UNITS if LEG_LENGTH[0] <= leg * unit <= LEG_LENGTH[1]]
     if not fitting:
@@ -345,11 +343,9 @@ def _find_up(recording: Recording, trunk: np.ndarray, nodes: dict[str, int]) -> 
         return moving
     advice = "set --up y or --up z, or up in the skeleton map"
     if standing is None or along[standing] <= -UPRIGHT_SHARE:
-        x, y, z = mean
-        raise InputError(
-            f"{recording.path}: no up axis found, because the mean direction from pelvis to head is "
-            f"({x:.2f}, {y:.2f}, {z:.2f}); {advice}"
-        )
+        direction = ", ".join(f"{part:.2f}" for part in mean)
+        wrong = f"no up axis found, because the mean direction from pelvis to head is ({direction})"
+        raise InputError(f"{recording.path}: {wrong}; {advice}")
     if upright:
         raise InputError(
             f"{recording.path}: the person stands along {standing} in the zero pose, but along {moving} in "

@@ -236,15 +236,12 @@ def _write_notes(clips: Sequence[ImportedClip], settings: ImportSettings) -> Ite
                 yield f"{name}: {key} differs between clips: {several}; if this is wrong, set it in the map"
         count = sum(clip.stance.startswith(STRAIGHTEST) for clip in clips_of_map)
         if count > 1:
-            yield (
-                f"{name}: the zero pose of {count} clips is not a stance, so each clip uses a frame, "
-                "and head, hands and feet may be rotated differently; add rest to the map to avoid this"
-            )
+            cause = f"{name}: the zero pose of {count} clips is not a stance, so each clip uses a frame"
+            effect = "head, hands and feet may be rotated differently"
+            yield f"{cause}, and {effect}; add rest to the map to avoid this"
     if jumping := [clip.source for clip in clips if clip.first_step > JUMP]:
-        yield (
-            f"{_format_names(jumping, 1)}: frame 0 is far from frame 1, so it may be a T-pose; "
-            "exclude frame 0 with calibration_frame: true in a custom map"
-        )
+        wrong = f"{_format_names(jumping, 1)}: frame 0 is far from frame 1, so it may be a T-pose"
+        yield f"{wrong}; exclude frame 0 with calibration_frame: true in a custom map"
     floorless = [clip.source for clip in clips if clip.floor is None]
     if settings.floor == AUTO and floorless:
         yield f"{_format_names(floorless, 1)}: no foot stands still, so the floor height was not corrected"

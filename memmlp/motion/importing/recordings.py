@@ -20,7 +20,6 @@ from memmlp.motion.preparing.find_clips import FolderContent, find_files
 
 READERS: dict[str, Callable[[Path], Recording]] = {".bvh": read_bvh, ".amc": read_amc}
 EXPECTED = f"expected a {' or '.join(READERS)} file, or a folder with such files"
-HEADER = "the header's"
 INDEX = "*index.csv"
 COLUMNS = "Subject", "Trial #", "framerate"  # of the CMU database's index
 DIGITS = 16  # number of digits of a file's digest in known_rates.yaml
@@ -76,7 +75,7 @@ def find_rate(recording: Recording, relative: Path, user_rates: Mapping[str, flo
         for path in sorted(folder.glob(INDEX)):
             if (rate := _read_index(path).get(recording.path.stem)) is not None:
                 return Rate(rate, f"the rate in {path.name}")
-    return DATABASES if recording.fps is None else Rate(recording.fps, HEADER)
+    return DATABASES if recording.fps is None else Rate(recording.fps, "the header's")
 
 
 def make_folder_key(folder: Path) -> str:

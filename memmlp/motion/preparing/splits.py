@@ -149,10 +149,9 @@ def _count_groups(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
     needed = 1 + sum(count > 0 for count in counts.values())
     if total < needed:
         parts = ", ".join(["train", *(part for part, count in counts.items() if count)])
-        raise InputError(
-            f"data.split: {parts} need at least {needed} clips or groups, but there are {total}; "
-            "add clips, loosen data.split.groups or set a fraction to 0"
-        )
+        wrong = f"{parts} need at least {needed} clips or groups, but there are {total}"
+        advice = "add clips, loosen data.split.groups or set a fraction to 0"
+        raise InputError(f"data.split: {wrong}; {advice}")
     while sum(counts.values()) >= total:
         counts[max(counts, key=lambda part: counts[part])] -= 1
     return counts

@@ -271,8 +271,8 @@ def _make_foot_paths(t: Array, gait: Gait, style: Style, course: Course) -> Feet
     steps = []
     for side in (0, 1):
         first = np.ceil(course.phase[0] + 1 - gait.duty - side / 2) + side / 2
-        for strike in np.arange(first, course.phase[-1]):
-            steps.append(_make_step(t, gait, style, course, side, strike))
+        strikes = np.arange(first, course.phase[-1])
+        steps += [_make_step(t, gait, style, course, side, strike) for strike in strikes]
     return apply_foot_steps(t, start.places, start.yaws, steps)
 
 

@@ -1,7 +1,4 @@
-"""Executors start workers: processes, or jobs of a Slurm cluster.
-
-Each worker chooses its runs itself (`memmlp.sweep.worker`).
-"""
+"""Executors start workers: processes, or jobs of a Slurm cluster. Each worker chooses its runs itself."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol

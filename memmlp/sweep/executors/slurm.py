@@ -191,11 +191,8 @@ class Slurm:
             prepare_work(work, folder / str(number))
         script = folder / "job.sh"
         script.write_text(format_batch_script(folder, self.options, count), encoding="utf-8")
-        outside = {
-            name: value
-            for name, value in os.environ.items()
-            if not name.startswith(("SLURM_", "SRUN_")) or name in KEPT_VARIABLES
-        }
+        of_job = {name for name in os.environ if name.startswith(("SLURM_", "SRUN_"))} - {*KEPT_VARIABLES}
+        outside = {name: value for name, value in os.environ.items() if name not in of_job}
         try:
             command = ["sbatch", str(script)]
             done = subprocess.run(command, env=outside, capture_output=True, text=True, timeout=PATIENCE)

@@ -47,14 +47,12 @@ class Study:
             repair_journal(journal_path(folder))
         after = search.prune_after
         pruner = optuna.pruners.NopPruner() if after is None else optuna.pruners.MedianPruner(after, 0)
-        settings: dict[str, Any] = {
-            "storage": open_storage(search.storage, folder), "study_name": name, "pruner": pruner
-        }  # fmt: skip
+        storage = open_storage(search.storage, folder)
         try:
-            study = optuna.load_study(**settings)
+            study = optuna.load_study(storage=storage, study_name=name, pruner=pruner)
         except KeyError:
-            minimize = [StudyDirection.MINIMIZE] * len(search.objectives)
-            study = optuna.create_study(**settings, directions=minimize)
+            goals = [StudyDirection.MINIMIZE] * len(search.objectives)
+            study = optuna.create_study(storage=storage, study_name=name, pruner=pruner, directions=goals)
         if study.metric_names is None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)

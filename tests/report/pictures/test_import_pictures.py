@@ -44,7 +44,7 @@ def test_bad_files_are_named(folder: Path, tmp_path: Path):
     assert (len(clips), skipped.file, str(folder) in skipped.reason) == (6, "0/walk.npz", False)
     with pytest.raises(InputError, match=r"none of 1 files could be read.*0/walk\.npz"):
         read_sample(folder, 1)
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="no such file"):
         read_sample(tmp_path / "none.npz", 1)
 
 
