@@ -181,8 +181,8 @@ def compute_sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
     paper): global rotations (N, 3, 3, 3) and positions (N, 3, 3), metres, of head, left and right wrist.
     `memmlp.motion.body.SPARSE_*` has the layout. Frame 0 has no velocity and is dropped."""
     angular = rotations[:-1].transpose(-1, -2) @ rotations[1:]
-    sixd, velocities = matrix_to_sixd(rotations[1:]), positions[1:] - positions[:-1]
-    parts = (sixd, matrix_to_sixd(angular), positions[1:], velocities)
+    sixd, angular_sixd = matrix_to_sixd(rotations[1:]), matrix_to_sixd(angular)
+    parts = (sixd, angular_sixd, positions[1:], positions[1:] - positions[:-1])
     return torch.cat([part.flatten(1) for part in parts], 1)
 
 

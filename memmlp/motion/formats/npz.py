@@ -53,9 +53,9 @@ class NoMotionError(InputError):
 
 
 def read_clip(path: Path, name: str) -> Clip:
-    """Read a clip of an SMPL body. Pickled data is never loaded. Raises NoMotionError if
-    the file is a valid npz without rotations, and InputError if it is damaged, has invalid shapes or values,
-    or is too large. `motion.plausibility` checks whether the clip can be human motion."""
+    """Read a clip of an SMPL body. Pickled data is never loaded. Raises NoMotionError if the file is a valid
+    npz without rotations, and InputError if it is damaged, has invalid shapes or values, or is too large.
+    `motion.plausibility` checks whether the clip can be human motion."""
     with _open_npz(path) as file:
         layout, trans_key, rate_key = _find_keys(path, set(file.files))
         parts = [_read_columns(path, file, key, widths) for key, widths in layout.items()]
@@ -112,7 +112,7 @@ def _parse_rate(path: Path, value: np.ndarray) -> float:
         item = value.item()
         fps = float(item.decode() if isinstance(item, bytes) else item)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: the frame rate is not a number ({error})") from error
+        raise InputError(f"{path}: the frame rate is not a number ({str(error)[:120]})") from error
     low, high = FRAME_RATE_RANGE
     if not low <= fps <= high:
         raise InputError(f"{path}: the frame rate is {fps:g} Hz; must be from {low:g} to {high:g} Hz")
@@ -141,7 +141,7 @@ def _read_columns(path: Path, file: np.lib.npyio.NpzFile, key: str, widths: Sequ
         raise InputError(f"{found}; must be floats {' or '.join(f'(N, {width})' for width in widths)}")
     if not 0 < len(array) <= MAX_ROWS:
         raise InputError(f"{found}; must have 1 to {MAX_ROWS} frames")
-    return array.reshape(len(array), -1)[:, : widths[0]].astype(np.float64)
+    return np.ascontiguousarray(array.reshape(len(array), -1)[:, : widths[0]], np.float64)
 
 
 @contextmanager
