@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import outputs_option
+from memmlp.cli.sweep import run_workers
+from memmlp.cli.table import SHOWN_MODES, ShownSweep, make_plan_table, print_tables
+from memmlp.cli.workers import Workers, split_executor
+from memmlp.common.errors import InputError
 from memmlp.common.text_formats import join_command
-from memmlp.runs.lookup import DEFAULT
+from memmlp.config.compose_plan import find_sweep, make_plan
+from memmlp.runs.lookup import DEFAULT, find_shipped, find_shipped_clip, read_card
+from memmlp.runs.run import Run
 
 if TYPE_CHECKING:
     from memmlp.report.pictures.clip_pictures import ClipPiece
-    from memmlp.runs.run import Run
-    from memmlp.sweep.plan import Plan
 
 ABLATION = "demo"
 """The sweep that the demo runs."""
@@ -38,13 +42,15 @@ def demo(overrides: tuple[str, ...], outputs: Path) -> None:
     run = run_ablation(overrides, outputs.absolute())
     export_network(run, outputs.absolute(), folder)
     click.echo(f"\nthe demo took {time.monotonic() - began:.0f} s")
-    click.echo(describe_next_steps(overrides))
+    sweep = join_command(["memmlp", "sweep", ABLATION, *overrides, "seed=0,1,2,3,4"])
+    click.echo("next:")
+    click.echo("  memmlp live  # the network of part 1, moving in the browser")
+    click.echo(f"  {sweep}  # more seeds, for narrower intervals")
+    click.echo("  memmlp data import BVH_FOLDER --out outputs/data/mine  # your own recordings")
 
 
 def show_clip(folder: Path, began: float) -> None:
-    """Draw a shipped network's prediction for the shipped clip beside the truth, and print where it is."""
     from memmlp.report.pictures.clip_pictures import write_picture
-    from memmlp.runs.lookup import read_card
 
     card, path = read_card(DEFAULT), folder / "clip.svg"
     piece = predict_shipped_clip(card["title"])
@@ -63,23 +69,16 @@ def predict_shipped_clip(label: str) -> ClipPiece:
     from memmlp.motion.body import SPARSE_DIM, load_rest_joints
     from memmlp.motion.motion_source import ShippedMotion
     from memmlp.report.pictures.clip_pictures import ClipPiece
-    from memmlp.runs.lookup import find_shipped, find_shipped_clip
 
     run, path = find_shipped(DEFAULT), find_shipped_clip()
     assert run is not None
     clip = ShippedMotion(path, load_rest_joints("builtin")).open("test").read_clip(0)
     truth, motion = clip[:, SPARSE_DIM:], stream_onnx(OnnxStream(run.preferred_onnx), clip)
-    return ClipPiece(
-        path.stem, *(extract_positions(truth).numpy(), {label: extract_positions(motion).numpy()})
-    )
+    return ClipPiece(path.stem, extract_positions(truth).numpy(), {label: extract_positions(motion).numpy()})
 
 
 def run_ablation(overrides: Sequence[str], outputs: Path) -> Run:
     """Finish the demo's sweep, print its table, and return the first run of its control."""
-    from memmlp.cli.sweep import run_workers
-    from memmlp.cli.table import SHOWN_MODES, ShownSweep, make_plan_table, print_tables
-    from memmlp.cli.workers import Workers, split_executor
-    from memmlp.config.compose_plan import find_sweep, make_plan
     from memmlp.report.tables.measured_run import load_measured_run
 
     executor, settings, overrides = split_executor(overrides)
@@ -90,23 +89,14 @@ def run_ablation(overrides: Sequence[str], outputs: Path) -> Run:
         run_workers(chosen, plan, Workers(executor, settings))
     command = join_command(["memmlp", "sweep", ABLATION, *overrides])
     shown = ShownSweep(chosen, plan, None)
-    found = make_plan_table(shown, SHOWN_MODES["stream"], command, load_measured_run)
-    print_tables([found.table])
-    return find_control_run(plan, chosen.control)
-
-
-def find_control_run(plan: Plan, control: str | None) -> Run:
-    """Return the run of the control's first seed. Raises InputError if a run of the sweep has failed."""
-    from memmlp.common.errors import InputError
-
-    run = next(plan.get_run(entry) for entry in plan.entries if entry.label == control)
+    print_tables([make_plan_table(shown, SHOWN_MODES["stream"], command, load_measured_run).table])
+    run = next(plan.get_run(entry) for entry in plan.entries if entry.label == chosen.control)
     if not run.done:
         raise InputError(f"run {run.id}: {run.fault or 'is not finished'}; memmlp sweep {ABLATION} --retry")
     return run
 
 
 def export_network(run: Run, outputs: Path, folder: Path) -> None:
-    """Export a run to the folder, and print the file and the time of a step."""
     from memmlp.cli.export import ExportForm, write_exact
     from memmlp.config.open_run import open_run
     from memmlp.deploy.latency import measure_step_times
@@ -116,16 +106,3 @@ def export_network(run: Run, outputs: Path, folder: Path) -> None:
     times = measure_step_times(file)
     click.echo(f"\n3. Mem-MLP as ONNX: {file} ({file.stat().st_size / 1e6:.1f} MB, {line})")
     click.echo(f"   a frame on one core: {times['median_ms']:.2f} ms median, {times['p95_ms']:.2f} ms p95")
-
-
-def describe_next_steps(overrides: Sequence[str]) -> str:
-    """Return three commands that the user can try next, as a text."""
-    sweep = join_command(["memmlp", "sweep", ABLATION, *overrides, "seed=0,1,2,3,4"])
-    return "\n  ".join(
-        [
-            "next:",
-            "memmlp live  # the network of part 1, moving in the browser",
-            f"{sweep}  # more seeds, for narrower intervals",
-            "memmlp data import BVH_FOLDER --out outputs/data/mine  # your own recordings",
-        ]
-    )

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import PATH, check_runs_exist, device_option, outputs_option, plugins_option
+from memmlp.cli.options import PATH, add_run_options, check_runs_exist, device_option
 from memmlp.common.errors import InputError
-from memmlp.common.text_formats import make_override
+from memmlp.common.files import write_json
+from memmlp.common.text_formats import make_console, make_override
+from memmlp.runs.lookup import copy_shipped, find_run, find_shipped
 
 
 @click.command("eval")
@@ -20,8 +22,7 @@ from memmlp.common.text_formats import make_override
 @click.option("--json", "json_path", type=PATH, help="JSON file to write: mean metrics, and a row per clip.")
 @click.option("--again", is_flag=True, help="Repeat existing measurements.")
 @device_option
-@plugins_option
-@outputs_option
+@add_run_options
 def evaluate(
     run: str,
     overrides: tuple[str, ...],
@@ -44,12 +45,9 @@ def evaluate(
     if save_predictions is not None and save_predictions.exists() and not save_predictions.is_dir():
         raise InputError(f"--save-predictions {save_predictions}: must be a folder, not a file")
     from memmlp.cli.train_summary import list_run_warnings, make_all_metrics_tables
-    from memmlp.common.files import write_json
-    from memmlp.common.text_formats import make_console
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
     from memmlp.motion.motion_source import PreparedMotion
-    from memmlp.runs.lookup import copy_shipped, find_run, find_shipped
     from memmlp.training.request import read_clip_rows, read_results
     from memmlp.training.run_stages import complete_stages
 
@@ -85,8 +83,7 @@ def evaluate(
 @click.option("--mean", type=PATH, help="File with the mean of the rotations, if the network needs it.")
 @click.option("--std", type=PATH, help="File with the standard deviation of the rotations; needs --mean.")
 @click.option("--refiner", type=PATH, help="File with the weights of SAGE-Net's refiner.")
-@plugins_option
-@outputs_option
+@add_run_options
 def import_weights(
     model: str,
     checkpoint: Path,

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import PATH, outputs_option, plugins_option
+from memmlp.cli.options import PATH, add_run_options
+from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write, file_digest
+from memmlp.common.progress import announce
+from memmlp.runs.lookup import find_run
+from memmlp.runs.run import Run
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
     from memmlp.networks.motion_model import MotionModel, StreamingGraph
-    from memmlp.runs.run import Run
 
 FULL_TOLERANCE = 0.1
 """Maximum deviation in metres or rotation matrix entries. Broken files exceed it, fp16 files do not."""
@@ -21,8 +25,7 @@ FULL_TOLERANCE = 0.1
 
 class ExportForm(NamedTuple):
     """The requested form of an ONNX file. `full` is the frame of reference and the format of the joints'
-    rotations, for a file that computes joints from tracker poses; None for a file with only the network's
-    step."""
+    rotations for a file that computes joints from tracker poses; None for the network's step."""
 
     graph: str
     precision: str
@@ -75,8 +78,7 @@ class ExportForm(NamedTuple):
     type=click.Choice(["matrix", "quaternion"]),
     help="Format of the joints' rotations, with --scope full; quaternions are x, y, z, w.  [default: matrix]",
 )
-@plugins_option
-@outputs_option
+@add_run_options
 def export(
     run: str,
     out: Path,
@@ -94,15 +96,12 @@ def export(
     RUN is an id, the beginning of an id, or a folder. If the run already has a checked file of this form, the
     command copies it.
     """
-    from memmlp.common.errors import InputError
-    from memmlp.runs.lookup import find_run
-
     if out.suffix != ".onnx":
         raise InputError(f"--out {out}: must end in .onnx")
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
-    option = f"--space {space}" if space else f"--rotations {rotations}" if rotations else None
-    if scope == "step" and option:
+    if scope == "step" and (space or rotations):
+        option = f"--space {space}" if space else f"--rotations {rotations}"
         raise InputError(f"{option}: needs --scope full, since the other scope has AMASS' axes (Z up)")
     if precision == "fp32" and max_growth is not None:
         raise InputError(f"--max-growth {max_growth:g}: needs --precision fp16 or int8")
@@ -114,26 +113,23 @@ def export(
     if line is None:
         from memmlp.config.open_run import open_run
 
-        opened = open_run(outputs, run)
-        exact = precision == "fp32"
+        opened, exact = open_run(outputs, run), precision == "fp32"
         line = write_exact(opened, out, form) if exact else write_lower(opened, out, form, limit)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {line}")
 
 
 def copy_deployed(run: Run, out: Path, form: ExportForm, max_growth: float) -> str | None:
-    """Copy the file of the requested form from a deployment of the run. Return a line about the file's
-    recorded check; None if no deployment has such a file."""
-    from memmlp.common.files import atomic_write, file_digest
-
+    """Copy a deployment's file of the requested form; return a line about its check, or None without one."""
     for folder in sorted(run.deployments.glob("*")):
         deployed = run.deployment(folder.name)
         record, settings, path = deployed.record, deployed.settings, deployed.onnx_path(form.precision)
         graphs = settings.get("graph", "auto"), record.get("graph")  # the requested one, and the exported one
         if form.full or form.graph not in graphs or form.opset != settings.get("opset", 18):
             continue
-        if not (deployed.done and deployed.is_current) or path.name not in record["artifacts"]:
+        if not (deployed.done and deployed.is_current):
             continue
-        if record["artifacts"][path.name] != file_digest(path):
+        digest = record["artifacts"].get(path.name)
+        if digest is None or digest != file_digest(path):
             continue
         if form.precision == "fp32":
             line = f"differs from torch by at most {record['onnx_parity']:.1e}"
@@ -147,7 +143,6 @@ def copy_deployed(run: Run, out: Path, form: ExportForm, max_growth: float) -> s
 
 
 def describe_cost(cost: dict[str, Any], precision: str) -> str:
-    """Describe the loss of accuracy by lower precision."""
     names = ("MPJPE", "position MPJPE", "Jitter")
     changes = {name: f"{cost['fp32'][name]:.2f} -> {cost[precision][name]:.2f}" for name in names}
     if changes["position MPJPE"] == changes["MPJPE"]:  # without a position branch
@@ -156,7 +151,6 @@ def describe_cost(cost: dict[str, Any], precision: str) -> str:
 
 
 def load(opened: OpenedRun, form: ExportForm) -> tuple[MotionModel, MotionModel | StreamingGraph]:
-    """Return a run's trained network and its graph to export."""
     from memmlp.deploy.deployment import GRAPHS
     from memmlp.networks.streaming import check_is_stream
 
@@ -177,10 +171,8 @@ def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, 
 
 
 def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
-    """Write the float32 ONNX file if it matches the trained network on the longest test clip, and return a
-    line about the difference. Raises ClickException if they differ by more than rounding errors; then nothing
-    is written."""
-    from memmlp.common.progress import announce
+    """Write the float32 ONNX file if it matches the network on the longest test clip; return a line about
+    that."""
     from memmlp.deploy.parity import TOLERANCE, are_rounding_errors, measure_differences, select_parity_clip
     from memmlp.live.trackers_to_body_graph import measure_full_graph_differences
 
@@ -205,13 +197,9 @@ def write_exact(opened: OpenedRun, out: Path, form: ExportForm) -> str:
 
 
 def write_lower(opened: OpenedRun, out: Path, form: ExportForm, max_growth: float) -> str:
-    """Write the ONNX file with lower precision if it is accurate enough, and return a line about the loss of
-    accuracy. It is measured for the network's step. A full graph has the same layers, so it is measured in
-    the same way, and also compared with torch on the first test clip. `max_growth` is the maximum relative
-    increase of MPJPE. Raises InputError for a network without a streaming graph, and ClickException if MPJPE
-    increases by more, or a full graph does not match the network; then nothing is written."""
-    from memmlp.common.errors import InputError
-    from memmlp.common.progress import announce
+    """Write the ONNX file with lower precision if MPJPE increases at most by the fraction `max_growth`.
+    Return a line about the loss of accuracy, measured for the network's step. A full graph has the same
+    layers; it is also compared with torch on the first test clip."""
     from memmlp.deploy.lower_precision import compare_accuracy, write_lower_precision
     from memmlp.live.trackers_to_body_graph import measure_full_graph_differences
     from memmlp.networks.motion_model import StreamingGraph

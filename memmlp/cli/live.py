@@ -19,13 +19,21 @@ from memmlp.cli.options import (
     SenderNetwork,
     TargetAddress,
     add_page_options,
+    add_run_options,
     check_runs_exist,
-    host_option,
-    outputs_option,
-    plugins_option,
-    token_option,
 )
-from memmlp.runs.lookup import DEFAULT, find_shipped, find_shipped_clip, get_shipped_name
+from memmlp.common.errors import InputError
+from memmlp.common.page_server import check_token
+from memmlp.common.processes import finish_uninterrupted
+from memmlp.runs.lookup import (
+    DEFAULT,
+    count_training_frames,
+    find_run,
+    find_shipped,
+    find_shipped_clip,
+    get_shipped_name,
+    warn_if_hardly_trained,
+)
 
 if TYPE_CHECKING:
     from memmlp.live.outputs import Output, Outputs
@@ -142,10 +150,7 @@ class LiveOptions(NamedTuple):
     help="Show a VRM avatar on the page: FILE.vrm, or the built-in avatar.",
 )
 @add_page_options(port=8765)
-@host_option
-@token_option
-@plugins_option
-@outputs_option
+@add_run_options
 def live(**options: Any) -> None:
     """Show a network live, on a local web page; by default a shipped network on a shipped clip.
 
@@ -162,10 +167,6 @@ def live(**options: Any) -> None:
 
 
 def check_options(options: LiveOptions) -> None:
-    """Raise InputError for contradictory options, or for options that need a missing package."""
-    from memmlp.common.errors import InputError
-    from memmlp.common.page_server import check_token
-
     tracker_options = {
         "--height": options.height is not None,
         "--floor": options.floor is not None,
@@ -188,7 +189,6 @@ def check_options(options: LiveOptions) -> None:
 
 
 def make_source(options: LiveOptions) -> TrackerSource:
-    """Return the source of the poses: packets at a port, or a repeated clip."""
     from memmlp.live.session.sources import ClipSource, PacketSource, parse_json_packet, parse_osc_packet
 
     if options.packets is None:
@@ -199,9 +199,7 @@ def make_source(options: LiveOptions) -> TrackerSource:
 
 
 def load_tracked_clip(options: LiveOptions) -> TrackedClip:
-    """Load the clip of --clip: an AMASS npz file on the network's body, or a test clip of the run. Raises
-    InputError for an unknown test clip, or for a test clip of an ONNX file or a shipped network."""
-    from memmlp.common.errors import InputError
+    """Load the clip of --clip: an AMASS npz file on the network's body, or a test clip of the run."""
     from memmlp.live.session.sources import TrackedClip, read_npz_frames
     from memmlp.live.stream import ExportedNetwork
 
@@ -229,12 +227,10 @@ def serve(options: LiveOptions) -> None:
     import threading
     import webbrowser
 
-    from memmlp.common.processes import finish_uninterrupted
     from memmlp.live.session import server as page
     from memmlp.live.session.loop import Fitting, make_greeting, run_loop
     from memmlp.live.stream import Stream
     from memmlp.motion.formats.gltf import encode_vrm
-    from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
 
     with contextlib.closing(make_source(options)) as source:
         file, name = find_network_file(options)
@@ -271,8 +267,6 @@ def serve(options: LiveOptions) -> None:
 
 def find_network_file(options: LiveOptions) -> tuple[Path, str]:
     """Return the path of the network's ONNX file, and the network's name."""
-    from memmlp.runs.lookup import find_run
-
     if options.is_onnx_file:
         return Path(options.network), Path(options.network).name
     run = find_run(options.outputs, options.network)
@@ -299,7 +293,6 @@ def combine_calibration(options: LiveOptions, space: SpaceName, stream: Stream) 
 
 
 def make_outputs(options: LiveOptions, stream: Stream) -> Outputs:
-    """Return the outputs that the options request."""
     from memmlp.live.outputs import VMC, VMC_PORT, VRCHAT_PORT, Outputs, Receiver, Recorder, VRChat
 
     outputs: list[Output] = [VMC(Receiver(host, port or VMC_PORT, "--vmc")) for host, port in options.vmc]
@@ -311,5 +304,4 @@ def make_outputs(options: LiveOptions, stream: Stream) -> Outputs:
 
 
 def print_note(line: str) -> None:
-    """Print a line to stderr."""
     click.echo(line, err=True)

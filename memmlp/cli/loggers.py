@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from memmlp.cli.options import outputs_option
+from memmlp.common.components import find_component
+from memmlp.common.progress import progress_bar
+from memmlp.runs.lookup import list_runs
 
 if TYPE_CHECKING:
     from memmlp.runs.loggers.logger import RunLogger
@@ -36,9 +40,7 @@ def sync(names: tuple[str, ...], outputs: Path) -> None:
     Then the loggers show the same as the run folders, without duplicates. Runs in progress are skipped,
     because their own processes update the loggers. You can repeat the command at any time.
     """
-    from memmlp.common.progress import progress_bar
     from memmlp.runs.loggers import logger as run_loggers
-    from memmlp.runs.lookup import list_runs
 
     started = [run for run in list_runs(outputs) if run.manifest]
     warnings: list[str] = []
@@ -54,13 +56,5 @@ def sync(names: tuple[str, ...], outputs: Path) -> None:
 
 
 def _make_loggers(names: Sequence[str], outputs: Path) -> list[RunLogger]:
-    from memmlp.runs.loggers.mlflow import MLflow
-    from memmlp.runs.loggers.tensorboard import TensorBoard
-    from memmlp.runs.loggers.wandb import WandB
-
-    makers: dict[str, Callable[[], RunLogger]] = {
-        "mlflow": lambda: MLflow(None, outputs),
-        "tensorboard": lambda: TensorBoard(outputs),
-        "wandb": lambda: WandB("memmlp", outputs),
-    }
-    return [makers[name]() for name in dict.fromkeys(names)]
+    components = [find_component("loggers", name) for name in dict.fromkeys(names)]
+    return [one.build(asdict(one.settings()), outputs=outputs) for one in components]

@@ -1,6 +1,5 @@
 """The command `memmlp`. A sub-command is imported only when it is called, so that --help is quick."""
 
-import difflib
 import errno
 import importlib
 import os
@@ -13,9 +12,9 @@ import click
 
 import memmlp
 from memmlp.common import distributed
-from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged, is_interruption
+from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged, is_interruption, suggest
 from memmlp.common.processes import collect_garbage_rarely, treat_termination_as_interrupt
-from memmlp.common.progress import send_announcements_to
+from memmlp.common.progress import print_announcements
 from memmlp.common.text_formats import print_in_any_encoding
 
 
@@ -55,30 +54,25 @@ INTERRUPTED = 130  # exit code after a Ctrl-C
 
 
 class CommandGroup(click.Group):
-    """A group of commands that imports each command only when it is called."""
+    """The commands, each imported only when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the commands' names in the order of COMMANDS."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import and return the command with that name; None for an unknown name."""
         if (command := COMMANDS.get(cmd_name)) is None:
             return None
         return getattr(importlib.import_module(f"memmlp.cli.{command.module}"), command.attribute)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the help lines of COMMANDS, without importing the commands."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, command.help) for name, command in COMMANDS.items()])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command for the first argument. Raises InputError, with a hint, for an unknown command."""
         if args[0] not in COMMANDS:
-            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
-            hint = f"did you mean {near[0]}? " if near else ""
+            hint = suggest(args[0], COMMANDS)
             raise InputError(f"{args[0]}: unknown command; {hint}use one of {', '.join(COMMANDS)}")
         return super().resolve_command(ctx, args)
 
@@ -93,9 +87,8 @@ def commands() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 after an interruption. Without
-    `argv`, the command is the whole process; then SIGTERM acts like Ctrl-C. With MEMMLP_TRACEBACK=1 in the
-    environment, errors are raised with their traceback."""
+    """Run a command line. Without `argv`, the command is the whole process; then SIGTERM acts like Ctrl-C.
+    With MEMMLP_TRACEBACK=1 in the environment, errors are raised with their traceback."""
     is_process = argv is None
     print_in_any_encoding()
     if is_process:
@@ -126,7 +119,7 @@ def _run_command_line(arguments: list[str]) -> None:
     if arguments[:1] in (["-sc"], ["--shell-completion"]):
         _print_completions(arguments)
     else:
-        with send_announcements_to():
+        with print_announcements():
             commands.main(arguments, prog_name="memmlp", standalone_mode=False)
 
 

@@ -5,7 +5,9 @@ from typing import Any
 
 import click
 
+from memmlp.common.errors import InputError
 from memmlp.common.processes import MIN_CORE_FRACTION
+from memmlp.common.text_formats import make_console
 from memmlp.runs.lookup import find_shipped_clip, list_shipped, read_card
 
 
@@ -18,16 +20,13 @@ def models(name: str | None, markdown: bool) -> None:
     A name works wherever a run is named: memmlp live NAME, predict, render, export, web, eval, and
     memmlp.Stream(NAME) in Python.
     """
-    from memmlp.common.errors import InputError
-
     names = list_shipped()
     if name is not None and name not in names:
         raise InputError(f"NAME {name}: must be one of {', '.join(names)}")
     cards = [read_card(one) for one in ([name] if name else names)]
-    if markdown:
-        click.echo("\n".join(line for card in cards for line in format_card(card)))
-    elif name:
-        click.echo("\n".join(line for card in cards for line in format_card(card)).replace("`", ""))
+    if name or markdown:
+        text = "\n".join(line for card in cards for line in format_card(card))
+        click.echo(text if markdown else text.replace("`", ""))
     else:
         list_networks(cards)
 
@@ -36,8 +35,6 @@ def list_networks(cards: list[dict[str, Any]]) -> None:
     """Print a line for each network, with its errors on unseen persons."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
-
-    from memmlp.common.text_formats import make_console
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("name", no_wrap=True)
@@ -55,7 +52,6 @@ def list_networks(cards: list[dict[str, Any]]) -> None:
 
 
 def format_card(card: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of a card in Markdown."""
     recipe, persons, clip, latency = card["recipe"], card["persons"], card["clip"], card["latency"]
     yield f"## `{card['name']}`: {card['title']}"
     yield ""
@@ -78,30 +74,27 @@ def format_card(card: Mapping[str, Any]) -> Iterator[str]:
     yield ""
     if "GT Jitter" in errors:
         yield f"- The true Jitter of all test clips is {errors['GT Jitter'][0]:.2f}."
-    yield f"- On the shipped clip (`{clip['name']}`, {clip['seconds']:g} s, a test person): " + (
+    yield (
+        f"- On the shipped clip (`{clip['name']}`, {clip['seconds']:g} s, a test person): "
         f"MPJPE {clip['errors']['rotation']['MPJPE']:.2f} cm."
     )
     yield (
         f"- Training: {recipe['steps']} steps of {recipe['batch']} windows of {recipe['frames']} frames, "
-        + (
-            f"{recipe['name']}, learning rate {recipe['lr']:g}; the weights of step {recipe['best_step']} "
-            f"had the lowest {recipe['best_by']} MPJPE on validation persons."
-        )
+        f"{recipe['name']}, learning rate {recipe['lr']:g}; the weights of step {recipe['best_step']} "
+        f"had the lowest {recipe['best_by']} MPJPE on validation persons."
     )
     if others := card.get("candidates"):
-        yield (
-            "- Chosen by validation MPJPE from trainings with and without mirrored windows: "
-            + "; ".join(
-                f"{one['tflop']:g} TFLOP{' mirrored' * one['mirror']} {one['validation MPJPE']:.2f} cm"
-                for one in others
-            )
-            + "."
+        shown = "; ".join(
+            f"{one['tflop']:g} TFLOP{' mirrored' * one['mirror']} {one['validation MPJPE']:.2f} cm"
+            for one in others
         )
+        yield f"- Chosen by validation MPJPE from trainings with and without mirrored windows: {shown}."
     yield f"- Size: {card['parameters'] / 1e6:.2f} M parameters, {card['weights']}."
     if latency["core_share"] < MIN_CORE_FRACTION:
         yield "- Latency: not measured on a quiet machine yet."
     else:
-        yield f"- A step on one core ({latency['cpu']}): {latency['median_ms']:.2f} ms, median; " + (
+        yield (
+            f"- A step on one core ({latency['cpu']}): {latency['median_ms']:.2f} ms, median; "
             f"{latency['ratio_to_yardstick']:.2f} times the yardstick."
         )
     yield f"- Command: `{card['command']}` (commit `{card['commit'][:8]}`)."

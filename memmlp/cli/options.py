@@ -1,18 +1,18 @@
 """Command-line options and parameter types that several commands share."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable
 from ipaddress import IPv4Network
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-if TYPE_CHECKING:
-    from memmlp.runs.run import Run
+from memmlp.common.settings import DEVICE
+from memmlp.config.plugins import activate, search_folder, split_names
+from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
+from memmlp.runs.run import Run
 
 Command = Callable[..., Any]
 PORT = click.IntRange(1, 65535)
@@ -25,7 +25,6 @@ class HomePath(click.Path):
         super().__init__(path_type=Path, **options)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path."""
         return super().convert(os.path.expanduser(value), param, ctx)
 
 
@@ -33,10 +32,9 @@ PATH = HomePath()
 
 
 class FiniteFloat(click.FloatRange):
-    """A number in a range, without NaN and infinity."""
+    """A number in a range, without NaN and infinity, which click would accept."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number; reject NaN and infinity, which click would accept."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} must be a finite number", param, ctx)
@@ -44,14 +42,11 @@ class FiniteFloat(click.FloatRange):
 
 
 class DeviceName(click.ParamType):
-    """A device name with the syntax of the key `device`."""
+    """A device name with the syntax of the key `device`. The device may not exist."""
 
     name = "auto|cpu|cuda|cuda:INDEX|mps"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the name. Whether the device exists is checked only on use."""
-        from memmlp.common.settings import DEVICE
-
         if not DEVICE.allows(value):
             self.fail(f"{value}: must be {DEVICE.words}")
         return value
@@ -66,12 +61,11 @@ device_option = click.option(
 
 
 class TargetAddress(click.ParamType):
-    """The address of a program that receives datagrams: HOST, or HOST:PORT."""
+    """The address of a program that receives datagrams: HOST, or HOST:PORT; as host, and port or None."""
 
     name = "HOST[:PORT]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return host and port. The port is None for HOST."""
         if isinstance(value, tuple):
             return value
         host, colon, port = value.rpartition(":")
@@ -86,7 +80,6 @@ class SenderNetwork(click.ParamType):
     name = "ADDRESS"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the network."""
         try:
             return IPv4Network(value, strict=False)
         except ValueError as error:
@@ -119,12 +112,16 @@ weigh_groups_option = click.option(
 )
 
 
-def add_page_options(port: int) -> Callable[[Command], Command]:
-    """Add the options --port, with the default `port`, and --no-browser to a command that serves a page."""
-    limits, help_text = click.IntRange(0, 65535), "Port of the page; 0 selects a free port."
-    number = click.option("--port", default=port, type=limits, help=help_text)
-    browser = click.option("--no-browser", is_flag=True, help="Print the page's address; open no browser.")
-    return lambda command: number(browser(command))
+def add_clip_options(command: Command) -> Command:
+    """Add the options that select and group test clips."""
+    return source_option(together_option(weigh_groups_option(command)))
+
+
+untrained_option = click.option(
+    "--untrained",
+    is_flag=True,
+    help="Measure the costs of networks without a run, with random weights; only for Tables 16 and 17.",
+)
 
 
 host_option = click.option(
@@ -138,16 +135,20 @@ token_option = click.option(
 )
 
 
-def _activate_plugins(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
-    from memmlp.config.plugins import activate, split_names
+def add_page_options(port: int) -> Callable[[Command], Command]:
+    """Add the options of a page's server to a command; `port` is the default port."""
+    limits, help_text = click.IntRange(0, 65535), "Port of the page; 0 selects a free port."
+    number = click.option("--port", default=port, type=limits, help=help_text)
+    browser = click.option("--no-browser", is_flag=True, help="Print the page's address; open no browser.")
+    return lambda command: number(browser(host_option(token_option(command))))
 
+
+def _activate_plugins(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
     if not ctx.resilient_parsing:
         activate(split_names(value or ""))
 
 
 def _add_config_folder(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
-    from memmlp.config.plugins import search_folder
-
     if not ctx.resilient_parsing:
         ctx.with_resource(search_folder(value))
 
@@ -159,6 +160,12 @@ plugins_option = click.option(
     expose_value=False,
     help="Comma-separated packages with your own components; also MEMMLP_PLUGINS. Their code is run.",
 )
+
+
+def add_run_options(command: Command) -> Command:
+    """Add the options --plugins and --outputs."""
+    return plugins_option(outputs_option(command))
+
 
 config_dir_option = click.option(
     "--config-dir",
@@ -182,16 +189,11 @@ strict_option = click.option("--strict", is_flag=True, help="Stop at the first b
 
 def check_runs_exist(outputs: Path, *names: str) -> None:
     """Raise InputError for an unknown run, before slow imports."""
-    from memmlp.runs.lookup import find_run
-
     for name in names:
         find_run(outputs, name)
 
 
 def warn_about_training(*runs: Run) -> None:
-    """Warn on standard error about runs with too little training."""
-    from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
-
     for run in runs:
         if remark := warn_if_hardly_trained(count_training_frames(run)):
             click.echo(f"run {run.id}: {remark}", err=True)

@@ -9,14 +9,15 @@ import click
 
 from memmlp.cli.options import (
     PATH,
+    add_run_options,
     check_runs_exist,
     device_option,
     format_option,
-    outputs_option,
-    plugins_option,
     strict_option,
     warn_about_training,
 )
+from memmlp.common.errors import InputError
+from memmlp.runs.lookup import find_run
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -43,8 +44,7 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @strict_option
 @device_option
-@plugins_option
-@outputs_option
+@add_run_options
 def predict(
     run: str,
     source: str,
@@ -68,7 +68,6 @@ def predict(
     from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.body import check_imported_body
     from memmlp.motion.exporting import plan_export
-    from memmlp.runs.lookup import find_run
 
     opened_run = find_run(outputs, run)
     words = [] if ik is None else [f"evaluation.ik={ik}"]
@@ -91,9 +90,7 @@ def predict(
 
 
 def choose_branch(evaluation: Evaluation, branch: str | None) -> str:
-    """Return the branch of --branch; by default combined if inverse kinematics is on, otherwise rotation.
-    Raises InputError for --branch combined without inverse kinematics."""
-    from memmlp.common.errors import InputError
+    """Return the branch of --branch; by default combined if inverse kinematics is on, otherwise rotation."""
     from memmlp.evaluation.ik import NoIK
 
     solved = not isinstance(evaluation.ik, NoIK)
@@ -105,9 +102,6 @@ def choose_branch(evaluation: Evaluation, branch: str | None) -> str:
 def predict_test_clip(
     predictor: ClipPredictor, run: OpenedRun, name: str, out: Path, format_: str | None
 ) -> ExportReport:
-    """Write the network's prediction for a test clip. Raises InputError if the clip does not exist, or `out`
-    has another format or cannot be written."""
-    from memmlp.common.errors import InputError
     from memmlp.motion.body import FPS
     from memmlp.motion.exporting import ExportReport, choose_format, write_motion
 

@@ -7,14 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import (
-    FiniteFloat,
-    HomePath,
-    check_runs_exist,
-    outputs_option,
-    plugins_option,
-    warn_about_training,
-)
+from memmlp.cli.options import FiniteFloat, HomePath, add_run_options, check_runs_exist, warn_about_training
+from memmlp.common.errors import InputError
+from memmlp.common.progress import announce
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -56,8 +51,7 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
 @click.option(
     "--poses", default=6, type=click.IntRange(1, 20), help="Number of evenly spaced poses in a PNG."
 )
-@plugins_option
-@outputs_option
+@add_run_options
 def render(
     runs: tuple[str, ...],
     clip: str | None,
@@ -76,8 +70,6 @@ def render(
     GIF or MP4 shows the runs side by side at 30 frames per second. All runs share one colour scale.
     """
     check_runs_exist(outputs, *runs)
-    from memmlp.common.errors import InputError
-    from memmlp.common.progress import announce
     from memmlp.config.open_run import open_run
     from memmlp.report.pictures.clip_pictures import check_picture_path, write_picture
 
@@ -99,12 +91,9 @@ def render(
 def _predict_piece(
     runs: dict[str, OpenedRun], clip: str | None, begin: float, end: float | None, branch: str, mode: str
 ) -> ClipPiece:
-    """Return a clip between two times in seconds, with the runs' predictions by label. Raises InputError if
-    the piece is empty, or the runs' ground truths for the clip differ."""
+    """Return a clip between two times in seconds, with the runs' predictions by label."""
     import numpy as np
 
-    from memmlp.common.errors import InputError
-    from memmlp.common.progress import announce
     from memmlp.config.open_run import find_clip
     from memmlp.evaluation.predictions import predict_clip
     from memmlp.report.pictures.clip_pictures import ClipPiece, find_frame_range

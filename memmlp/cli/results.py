@@ -12,14 +12,16 @@ import click
 
 from memmlp.cli.options import (
     HomePath,
+    add_clip_options,
+    add_run_options,
     config_dir_option,
-    outputs_option,
-    plugins_option,
-    source_option,
-    together_option,
-    weigh_groups_option,
+    untrained_option,
 )
+from memmlp.cli.table import flag_changed_rounds, load_shown_sweep, print_tables
 from memmlp.common.errors import InputError
+from memmlp.common.files import make_json_safe
+from memmlp.config.compose_plan import find_sweep, is_path
+from memmlp.runs.identity import list_outdated
 
 if TYPE_CHECKING:
     from memmlp.report.kept_results import KeptResults
@@ -37,15 +39,10 @@ def results() -> None:
 @click.argument("name", metavar="SWEEP")
 @click.argument("overrides", nargs=-1)
 @click.option("--out", type=HomePath(file_okay=False), default=FOLDER / "data", help="Folder to write to.")
-@click.option(
-    "--untrained",
-    is_flag=True,
-    help="Measure the costs of networks without a run, with random weights; only for Tables 16 and 17.",
-)
+@untrained_option
 @click.option("--name", "stem", help="File name without suffix.  [default: the sweep's name]")
 @config_dir_option
-@plugins_option
-@outputs_option
+@add_run_options
 def save_command(
     name: str, overrides: tuple[str, ...], out: Path, untrained: bool, stem: str | None, outputs: Path
 ) -> None:
@@ -54,9 +51,6 @@ def save_command(
     SWEEP and OVERRIDES are those of `memmlp sweep`. The command does not replace a file that has results of
     additional runs.
     """
-    from memmlp.cli.table import load_shown_sweep
-    from memmlp.common.files import make_json_safe
-    from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import KeptResults, list_overrides, shorten_paths
     from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
     from memmlp.report.tables.measured_run import load_measured_run
@@ -123,14 +117,10 @@ def _load_named(folder: Path, name: str) -> KeptResults:
 
 @results.command("show")
 @click.argument("name", metavar="NAME")
-@source_option
-@together_option
-@weigh_groups_option
+@add_clip_options
 @click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Its data/ has the results.")
 def show(name: str, source: str | None, together: tuple[str, ...], weigh_groups: bool, folder: Path) -> None:
     """Print the table of kept results. NAME is the name of their file; no run is needed."""
-    from memmlp.cli.table import print_tables
-
     print_tables([make_kept_table(_load_named(folder, name), source, together, weigh_groups)])
 
 
@@ -140,14 +130,9 @@ def make_kept_table(
     patterns: Sequence[str] = (),
     weigh_groups: bool = False,
 ) -> Table:
-    """Compute the table of kept results for the sweep's seeds and all additional seeds with runs. With
-    `source`, only its test clips count. Test clips form one group if a pattern matches the same text in their
-    names. With `weigh_groups`, each group has the same weight."""
-    from memmlp.cli.table import flag_changed_rounds
-    from memmlp.config.compose_plan import find_sweep
+    """Compute the table of kept results for the sweep's seeds and all additional seeds with runs."""
     from memmlp.report.tables.build_table import make_table, restrict_and_group_clips
     from memmlp.report.tables.seed_rounds import Rounds
-    from memmlp.runs.identity import list_outdated
 
     # With the command line's overrides, the table warns about changed data.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)

@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from functools import partial
+from collections.abc import Collection, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
+from memmlp.cli.options import add_run_options, config_dir_option
+from memmlp.cli.table import (
+    SHOWN_MODES,
+    ShownSweep,
+    align_columns,
+    flag_earlier_rounds,
+    get_rounds_path,
+    make_plan_table,
+    print_tables,
+    read_rounds,
+)
 from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.errors import InputError
-from memmlp.common.text_formats import join_command
+from memmlp.common.files import write_json
+from memmlp.common.lease import Lock
+from memmlp.common.text_formats import join_command, make_console
+from memmlp.config.compose_plan import find_sweep, get_sweep_folder, make_plan
+from memmlp.config.plugins import format_config_dir
 from memmlp.runs.identity import NETWORK
+from memmlp.runs.lookup import format_outputs_option
+from memmlp.sweep.definition import Sweep
+from memmlp.sweep.plan import FAULTY, Plan, estimate_time
 
 if TYPE_CHECKING:
-    from memmlp.cli.table import ShownSweep
-    from memmlp.report.tables.effects import RunsBySeed
     from memmlp.report.tables.seed_rounds import Analysis, Rounds
-    from memmlp.sweep.definition import Sweep
-    from memmlp.sweep.plan import Plan
 
 
 @click.command("sweep")
@@ -47,8 +60,7 @@ if TYPE_CHECKING:
     "--max-seeds", type=int, help="Maximum number of seeds per variant, with --until-decided.  [default: 13]"
 )
 @config_dir_option
-@plugins_option
-@outputs_option
+@add_run_options
 def sweep(
     name: str,
     overrides: tuple[str, ...],
@@ -72,9 +84,6 @@ def sweep(
     With --until-decided, all variants get three seeds first. Then variants with inconclusive verdicts, and
     their controls, get more seeds, up to --max-seeds.
     """
-    from memmlp.cli.table import ShownSweep, flag_earlier_rounds
-    from memmlp.config.compose_plan import find_sweep, get_sweep_folder, make_plan
-
     check_rounds_options(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
         raise InputError("--again: cannot be combined with --until-decided, --status or --dry-run")
@@ -98,21 +107,18 @@ def sweep(
             show_forecast(seeded, selected, labels, workers, get_sweep_folder(chosen, outputs))
         return
     reset_runs(selected, retry, again)
-    work = partial(run_workers, workers=workers)
-    arguments = [name, *overrides]
     if rounds:
-        rounds, plan = run_until_decided(chosen, outputs, rounds, work)
-        show_outcome(ShownSweep(rounds.restrict_sweep(chosen), plan, rounds), arguments, chosen, labels)
-        return
-    if selected.list_remaining():
-        work(chosen, selected)
-    flags = flag_earlier_rounds(chosen, outputs)
-    show_outcome(ShownSweep(chosen, plan, None, flags), arguments, chosen, labels)
+        rounds, plan = run_until_decided(chosen, outputs, rounds, workers)
+        shown = ShownSweep(rounds.restrict_sweep(chosen), plan, rounds)
+    else:
+        if selected.list_remaining():
+            run_workers(chosen, selected, workers)
+        shown = ShownSweep(chosen, plan, None, flag_earlier_rounds(chosen, outputs))
+    show_outcome(shown, [name, *overrides], chosen, labels)
 
 
 def reset_runs(plan: Plan, failed: bool, networks: bool) -> None:
-    """Reset a plan's failed runs, or all its started or finished networks. Prerequisites keep their
-    results."""
+    """Reset a plan's failed runs, or all its started or finished networks, but not their prerequisites."""
     for task in plan.tasks if failed else ():
         plan.get_run(task).retry()
     started = [task for task in plan.tasks if networks and task.kind == NETWORK]
@@ -122,8 +128,6 @@ def reset_runs(plan: Plan, failed: bool, networks: bool) -> None:
 
 
 def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
-    """Start workers, and wait until they have finished the plan's runs."""
-    from memmlp.config.compose_plan import get_sweep_folder
     from memmlp.sweep.controller import complete_plan
     from memmlp.sweep.progress_table import Board
 
@@ -132,14 +136,11 @@ def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
 
 
 def list_devices(plan: Plan) -> set[str]:
-    """Return the values of the key `device` of the plan's runs."""
     return {task.config["device"] for task in plan.tasks}
 
 
 def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
-    """Print the progress of a sweep's variants with these labels, and warnings about results of
-    older code."""
-    from memmlp.common.text_formats import make_console
+    """Print the progress of these variants, and warnings about results of older code."""
     from memmlp.sweep.progress_table import render
 
     shown = plan.select_variants(labels)
@@ -165,10 +166,7 @@ def count_unprepared_runs(chosen: Sweep, plan: Plan, labels: Collection[str]) ->
 
 
 def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: Workers, folder: Path) -> None:
-    """Print the expected time of the remaining runs, and the batch file for Slurm. VQ-VAEs are counted only
-    for runs with prepared data."""
-    from memmlp.sweep.plan import estimate_time
-
+    """Print the expected time of the remaining runs, and the batch file for Slurm."""
     count = workers.count_workers(workers.make_gpu_shares(list_devices(plan)))
     left, later = plan.list_remaining(), count_unprepared_runs(chosen, plan, labels)
     besides = ", and VQ-VAEs that these runs need" if later else ""
@@ -181,18 +179,12 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: W
 
 
 def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:
-    """Print the table `shown`, the number of finished runs, failed runs, and the next command, for the
-    executed variants. Exits with 1 if a run that these variants need has failed."""
-    from memmlp.cli.table import SHOWN_MODES, make_plan_table, print_tables
-    from memmlp.config import plugins
-    from memmlp.config.compose_plan import get_sweep_folder
+    """Print a table, failed runs and the next command. Exits with 1 if a run of the `labels` has failed."""
     from memmlp.report.tables.build_table import write_table
     from memmlp.report.tables.measured_run import load_measured_run
-    from memmlp.runs.lookup import format_outputs_option
-    from memmlp.sweep.plan import FAULTY
 
     plan, rounds = shown.plan, shown.rounds
-    command = join_command(["memmlp", "sweep", *arguments, *plugins.format_config_dir()])
+    command = join_command(["memmlp", "sweep", *arguments, *format_config_dir()])
     states = plan.read_states()
     failed = [task for task in plan.select_variants(labels).tasks if states[task.key] in FAULTY]
     found = make_plan_table(shown, SHOWN_MODES["both"], command, load_measured_run)
@@ -211,33 +203,29 @@ def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, lab
 
 
 def check_rounds_options(overrides: Sequence[str], until_decided: bool, max_seeds: int | None) -> None:
-    """Raise InputError for options that contradict --until-decided."""
     if max_seeds is None and not until_decided:
         return  # avoids the slow import of SciPy
     from memmlp.report.tables.seed_rounds import MAX_SEEDS
     from memmlp.report.tables.statistics import make_schedule
 
-    if max_seeds is not None and not until_decided:
+    if not until_decided:
         raise InputError("--max-seeds: needs --until-decided")
     if max_seeds is not None and max_seeds < (first := make_schedule(MAX_SEEDS)[0]):
         raise InputError(
             f"--max-seeds {max_seeds}: must be at least {first}, the number of seeds of the first analysis"
         )
     for override in overrides:
-        if until_decided and override.startswith("seed="):
+        if override.startswith("seed="):
             raise InputError(f"{override}: cannot be combined with --until-decided, which chooses the seeds")
 
 
 def load_rounds(sweep: Sweep, outputs: Path, max_seeds: int | None) -> Rounds:
-    """Load the seed rounds of a sweep; start new rounds if no interim analysis was done yet. `max_seeds` is
-    the maximum number of seeds per variant; None for that of the saved rounds, or the default. Raises
-    InputError if the saved analyses have another maximum, or the sweep has changed since."""
-    from memmlp.cli.table import get_rounds_path
-    from memmlp.report.tables.seed_rounds import MAX_SEEDS, Rounds, start_rounds
+    """Load the seed rounds of a sweep, or start new ones. `max_seeds` is the maximum number of seeds per
+    variant; None for that of the saved rounds, or the default."""
+    from memmlp.report.tables.seed_rounds import MAX_SEEDS, start_rounds
 
     path = get_rounds_path(sweep, outputs)
-    kept = Rounds.read(path)
-    if kept is None or not kept.analyses:
+    if (kept := read_rounds(sweep, outputs)) is None:
         return start_rounds(sweep, max_seeds or MAX_SEEDS)
     wanted = start_rounds(sweep, max_seeds or len(kept.seeds))
     if len(wanted.seeds) != len(kept.seeds):
@@ -249,13 +237,8 @@ def load_rounds(sweep: Sweep, outputs: Path, max_seeds: int | None) -> Rounds:
     return kept
 
 
-def run_until_decided(
-    sweep: Sweep, outputs: Path, rounds: Rounds, work: Callable[[Sweep, Plan], None]
-) -> tuple[Rounds, Plan]:
-    """Repeat interim analyses until no further analysis is possible; return the last rounds and plan. `work`
-    finishes the runs of a sweep's plan."""
-    from memmlp.cli.table import get_rounds_path
-    from memmlp.config.compose_plan import make_plan
+def run_until_decided(sweep: Sweep, outputs: Path, rounds: Rounds, workers: Workers) -> tuple[Rounds, Plan]:
+    """Finish runs and repeat interim analyses until no further one is possible."""
     from memmlp.report.tables.seed_rounds import check_same_runs
 
     while True:
@@ -263,7 +246,7 @@ def run_until_decided(
         plan = make_plan(spent, outputs, prepare=True)
         check_same_runs(rounds, sweep, plan, get_rounds_path(sweep, outputs))
         if plan.list_remaining():
-            work(spent, plan)
+            run_workers(spent, plan, workers)
         after = analyse(sweep, outputs, rounds, plan)
         if after == rounds:
             return rounds, plan
@@ -272,25 +255,18 @@ def run_until_decided(
 
 
 def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
-    """Do the next possible interim analysis, record it, and return the seed rounds. If another process has
-    done an analysis in the meantime, its rounds are returned instead."""
-    from dataclasses import asdict
-
-    from memmlp.cli.table import get_rounds_path
-    from memmlp.common.files import write_json
-    from memmlp.common.lease import Lock
+    """Do and record the next possible interim analysis, unless another process has done it."""
     from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
     from memmlp.report.tables.measured_run import load_measured_run
-    from memmlp.report.tables.seed_rounds import Rounds, digest_runs, do_next_analysis
+    from memmlp.report.tables.seed_rounds import digest_runs, do_next_analysis
 
     path = get_rounds_path(sweep, outputs)
     with Lock(path.parent).hold():
-        kept = Rounds.read(path)
-        if kept is not None and len(kept.analyses) > len(rounds.analyses):
+        kept = read_rounds(sweep, outputs)
+        if kept and len(kept.analyses) > len(rounds.analyses):
             return kept
-        runs: dict[str, RunsBySeed] = find_finished_runs(
-            rounds.restrict_sweep(sweep), make_run_finder(plan, load_measured_run)
-        )
+        finder = make_run_finder(plan, load_measured_run)
+        runs = find_finished_runs(rounds.restrict_sweep(sweep), finder)
         digests = {
             label: digest_runs(rounds, sweep, plan, label, rounds.schedule[number])
             for label, number in rounds.find_next_analyses(sweep).items()
@@ -301,8 +277,6 @@ def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
 
 
 def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None) -> list[str]:
-    """Describe each variant's progress: verdicts, number of seeds, and next interim analysis."""
-    from memmlp.cli.table import align_columns
     from memmlp.report.tables.seed_rounds import list_progress
 
     variants = list_progress(rounds, sweep)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import gc
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,25 +12,25 @@ import click
 
 from memmlp.cli.options import (
     HomePath,
+    add_clip_options,
+    add_run_options,
     config_dir_option,
-    outputs_option,
-    plugins_option,
-    source_option,
-    together_option,
-    weigh_groups_option,
+    untrained_option,
 )
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write
-from memmlp.common.text_formats import join_command
-from memmlp.sweep.definition import BRANCHES
+from memmlp.common.files import atomic_write, find_packaged_folder
+from memmlp.common.progress import progress_bar
+from memmlp.common.text_formats import join_command, make_console
+from memmlp.config.compose_plan import find_sweep, get_sweep_folder, make_plan
+from memmlp.config.plugins import format_config_dir
+from memmlp.sweep.definition import BRANCHES, Sweep
+from memmlp.sweep.plan import Plan
 
 if TYPE_CHECKING:
     from memmlp.report.tables.build_table import ReadRun
     from memmlp.report.tables.effects import RunsBySeed
     from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.report.tables.table import Table
-    from memmlp.sweep.definition import Sweep
-    from memmlp.sweep.plan import Plan
 
 SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
@@ -57,14 +56,8 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     type=click.Choice(BRANCHES),
     help="Show errors of this branch: rotation, position or combined.  [default: as in the paper's table]",
 )
-@source_option
-@together_option
-@weigh_groups_option
-@click.option(
-    "--untrained",
-    is_flag=True,
-    help="Measure the costs of networks without a run, with random weights; only for Tables 16 and 17.",
-)
+@add_clip_options
+@untrained_option
 @click.option(
     "--seeds-needed",
     is_flag=True,
@@ -76,8 +69,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     help="Show the published value, that of the authors' weights (memmlp import-weights) and yours.",
 )
 @config_dir_option
-@plugins_option
-@outputs_option
+@add_run_options
 def table(
     name: str,
     overrides: tuple[str, ...],
@@ -101,32 +93,23 @@ def table(
     from memmlp.report.tables.measured_run import load_measured_run
 
     selection = TableSelection(branch, source, together, weigh_groups, untrained)
-    gc.disable()  # garbage collection takes a second and finds nothing here
-    try:
-        results = gather_tables(
-            name, overrides, outputs, SHOWN_MODES[mode], functools.cache(load_measured_run), selection
-        )
-    finally:
-        gc.enable()
-    if seeds_needed:
-        print_needed_seeds(results, SHOWN_MODES[mode])
-        return
-    if official:
-        print_official_values(results, outputs, SHOWN_MODES[mode])
-        return
+    modes, read = SHOWN_MODES[mode], functools.cache(load_measured_run)
+    results = gather_tables(name, overrides, outputs, modes, read, selection)
     tables = [one.table for one in results]
+    if seeds_needed:
+        return print_needed_seeds(results, modes)
+    if official:
+        return print_official_values(results, outputs, modes)
     if form is None and out is None:
-        print_tables(tables)
-        return
-    text = _format_tables(tables, form or _choose_format(out), alone=name != "all")
-    if out is None:
-        click.echo(text, nl=False)
-    else:
+        return print_tables(tables)
+    text = _format_tables(tables, form, out, as_list=name == "all")
+    if out:
         write(out, text)
+    else:
+        click.echo(text, nl=False)
 
 
 def print_needed_seeds(tables: Sequence[SweepTable], modes: Sequence[str]) -> None:
-    """Print the number of seeds that the paper's effects need, for each sweep."""
     from memmlp.report.tables.effects import compute_needed_seeds
     from memmlp.report.tables.table_text import make_caption
 
@@ -139,7 +122,6 @@ def print_needed_seeds(tables: Sequence[SweepTable], modes: Sequence[str]) -> No
 
 
 def print_official_values(tables: Sequence[SweepTable], outputs: Path, modes: Sequence[str]) -> None:
-    """Print published values, values of imported weights and values of trainings, for each sweep."""
     from memmlp.report.tables.build_table import (
         find_imported_runs,
         list_official_values,
@@ -161,10 +143,9 @@ def print_official_values(tables: Sequence[SweepTable], outputs: Path, modes: Se
 
 
 class TableSelection(NamedTuple):
-    """A selection of a sweep's results for its table. `branch`: None for each variant's default; `source`:
-    show only its test clips; `together`: patterns of test clips that count as one group, in addition to the
-    groups of the data; `weigh_groups`: give each group the same weight; `untrained`: measure the costs of
-    networks without a run, with random weights."""
+    """A selection of a sweep's results for its table. `branch`: None for each variant's default; `together`:
+    patterns of test clips that count as one group; `untrained`: measure networks without a run, with random
+    weights."""
 
     branch: str | None = None
     source: str | None = None
@@ -177,8 +158,6 @@ EVERYTHING = TableSelection()
 
 
 class SweepTable(NamedTuple):
-    """A sweep, the finished runs of its variants by seed, and its table."""
-
     sweep: Sweep
     runs: dict[str, RunsBySeed]
     table: Table
@@ -192,21 +171,14 @@ def gather_tables(
     read: ReadRun,
     selection: TableSelection = EVERYTHING,
 ) -> list[SweepTable]:
-    """Make the tables of one sweep, or with `all`, of all tables of the paper. If the config of a paper's
-    table is incomplete (for example without the folder of AMASS), it shows only the paper's values and the
-    reason. `read` reads a run (`memmlp.report.tables.measured_run.load`). Raises InputError if no table can
-    be composed with these overrides, or no table has the selected results."""
-    from memmlp.common.progress import progress_bar
+    """Make the tables of one sweep, or with `all`, of all tables of the paper. If a table's config is
+    incomplete (for example without the folder of AMASS), it shows only the paper's values and the reason."""
     from memmlp.report.tables.build_table import make_empty_table
 
     tables, failures = [], []
     sweeps = find_sweeps(name, overrides)
     for sweep, command in progress_bar(sweeps, "tables") if len(sweeps) > 1 else sweeps:
         sweep = sweep.with_branch(selection.branch) if selection.branch else sweep
-        if selection.untrained:
-            from memmlp.config.untrained_costs import check_costs
-
-            check_costs(sweep)
         try:
             shown = load_shown_sweep(sweep, overrides, outputs.absolute())
             tables.append(make_plan_table(shown, modes, command, read, selection))
@@ -214,8 +186,8 @@ def gather_tables(
             failures.append(error)
             table = make_empty_table(sweep, modes, f"nothing measured: {error}")
             tables.append(SweepTable(sweep, {variant.label: {} for variant in sweep.list_runnable()}, table))
-    has_selection = overrides or selection.source or selection.together or tables[0].sweep.table is None
-    if failures and has_selection and len(failures) == len(tables):
+    chosen = overrides or selection.source or selection.together or selection.untrained
+    if failures and len(failures) == len(tables) and (chosen or tables[0].sweep.table is None):
         raise failures[0]
     return tables
 
@@ -227,7 +199,6 @@ def make_plan_table(
     read: ReadRun,
     selection: TableSelection = EVERYTHING,
 ) -> SweepTable:
-    """Return a planned sweep's finished runs, and the table of the selected results."""
     from memmlp.report.tables.build_table import (
         find_finished_runs,
         make_run_finder,
@@ -237,14 +208,9 @@ def make_plan_table(
     )
 
     sweep, plan, rounds, flags = shown
-    options = {
-        f"--source {selection.source}": selection.source,
-        f"--together {' '.join(selection.together)}": selection.together,
-        "--weigh-groups": selection.weigh_groups,
-    }
-    for option, given in options.items():
-        if given and rounds:
-            raise InputError(f"{option}: cannot be combined with --until-decided")
+    if rounds and (selection.source or selection.together or selection.weigh_groups):
+        options = "--source, --together, --weigh-groups"
+        raise InputError(f"{options}: cannot be combined with --until-decided")
     runs = find_finished_runs(sweep, make_run_finder(plan, read))
     if selection.untrained:
         from memmlp.config.untrained_costs import measure_untrained_variants
@@ -254,18 +220,13 @@ def make_plan_table(
     sweep, runs, restricted = restrict_and_group_clips(
         sweep, runs, selection.source, selection.together, selection.weigh_groups
     )
-    flags = (*restricted, *flags)
     command = f"{command} --until-decided" if rounds else command
     table = make_table(sweep, runs, modes, command, make_state_finder(plan), rounds)
-    return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
+    return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *restricted, *flags)))
 
 
 def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
-    """Find the sweeps with a name and overrides; return each sweep with its command."""
-    from memmlp.common.files import find_packaged_folder
-    from memmlp.config.compose_plan import find_sweep
-    from memmlp.config.plugins import format_config_dir
-
+    """Return the sweeps with a name and overrides, each with its command."""
     tables = sorted(path.stem for path in find_packaged_folder("sweeps").glob("table*.yaml"))
     return [
         (find_sweep(one, overrides), join_command(["memmlp", "sweep", one, *overrides, *format_config_dir()]))
@@ -274,13 +235,10 @@ def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
 
 
 def print_tables(tables: Sequence[Table]) -> None:
-    """Print tables for the width of the screen."""
-    from memmlp.common.text_formats import make_console
     from memmlp.report.tables.table_text import print_table
 
-    console = make_console()
     for one in tables:
-        print_table(one, console)
+        print_table(one, make_console())
 
 
 def align_columns(rows: Sequence[Sequence[str]], left: int) -> list[str]:
@@ -292,22 +250,16 @@ def align_columns(rows: Sequence[Sequence[str]], left: int) -> list[str]:
     ]
 
 
-def _format_tables(tables: Sequence[Table], form: str, alone: bool) -> str:
+def _format_tables(tables: Sequence[Table], form: str | None, out: Path | None, as_list: bool) -> str:
     from memmlp.report.tables.table_text import FORMATS
 
+    form = form or (out.suffix.removeprefix(".") if out else "")
+    if form not in FORMATS:
+        raise InputError(f"--out {out}: must have the suffix {', '.join(FORMATS)}, or needs --format")
     texts = [FORMATS[form](one) for one in tables]
-    if form == "json" and not alone:
+    if form == "json" and as_list:
         return "[\n" + ",\n".join(text.rstrip() for text in texts) + "\n]\n"
     return "\n".join(texts)
-
-
-def _choose_format(out: Path | None) -> str:
-    from memmlp.report.tables.table_text import FORMATS
-
-    ending = out.suffix.removeprefix(".") if out else ""
-    if ending not in FORMATS:
-        raise InputError(f"--out {out}: must have the suffix {', '.join(FORMATS)}, or needs --format")
-    return ending
 
 
 def write(out: Path, text: str) -> None:
@@ -331,14 +283,10 @@ class ShownSweep(NamedTuple):
 
 
 def load_shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownSweep:
-    """Load a sweep's plan, and its seed rounds if interim analyses were done. If the sweep has changed since,
-    the rounds are ignored and a flag warns about them."""
-    from memmlp.config.compose_plan import make_plan
-    from memmlp.report.tables.seed_rounds import Rounds, check_same_runs
+    """Load a sweep's plan and seed rounds. If the sweep has changed since, a flag replaces the rounds."""
+    from memmlp.report.tables.seed_rounds import check_same_runs
 
-    path = get_rounds_path(sweep, outputs)
-    kept = Rounds.read(path)
-    if kept is None or not kept.analyses:
+    if (kept := read_rounds(sweep, outputs)) is None:
         return ShownSweep(sweep, make_plan(sweep, outputs), None)
     seeds_given = any(override.startswith("seed=") for override in overrides)
     if flag := flag_changed_rounds(kept, sweep, seeds_given):
@@ -346,15 +294,14 @@ def load_shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> S
     spent = kept.restrict_sweep(sweep)
     plan = make_plan(spent, outputs)
     try:
-        check_same_runs(kept, sweep, plan, path)
+        check_same_runs(kept, sweep, plan, get_rounds_path(sweep, outputs))
     except InputError as error:
         return ShownSweep(spent, plan, None, (f"earlier interim analyses do not apply: {error}",))
     return ShownSweep(spent, plan, kept)
 
 
 def flag_changed_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) -> str | None:
-    """Return a warning if the sweep has changed since its interim analyses `kept`, or None. `seeds_given`:
-    the command line sets the seeds."""
+    """Return a warning if the sweep has changed since its interim analyses `kept`, or None."""
     from memmlp.report.tables.seed_rounds import start_rounds
 
     other = "seeds" if seeds_given else kept.find_difference(start_rounds(sweep, len(kept.seeds)))
@@ -364,18 +311,20 @@ def flag_changed_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) -
 
 
 def flag_earlier_rounds(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
-    """Return a warning for a table with a fixed number of seeds if interim analyses were done before."""
-    from memmlp.report.tables.seed_rounds import Rounds
-
-    kept = Rounds.read(get_rounds_path(sweep, outputs))
-    if kept is None or not kept.analyses:
+    if read_rounds(sweep, outputs) is None:
         return ()
     return ("after interim analyses, the error rate of these verdicts can exceed 5 %; see memmlp table",)
 
 
+def read_rounds(sweep: Sweep, outputs: Path) -> Rounds | None:
+    """Read a sweep's saved seed rounds; None if no interim analysis was done yet."""
+    from memmlp.report.tables.seed_rounds import Rounds
+
+    kept = Rounds.read(get_rounds_path(sweep, outputs))
+    return kept if kept and kept.analyses else None
+
+
 def get_rounds_path(sweep: Sweep, outputs: Path) -> Path:
-    """Return the path of a sweep's saved seed rounds."""
-    from memmlp.config.compose_plan import get_sweep_folder
     from memmlp.report.tables.seed_rounds import ROUNDS_FILE
 
     return get_sweep_folder(sweep, outputs) / ROUNDS_FILE

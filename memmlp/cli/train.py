@@ -71,8 +71,7 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
 
 
 def _run_with_hydra(args: argparse.Namespace, train_from_config: Callable[[DictConfig], None]) -> None:
-    """Run or print the jobs with Hydra, which reads its arguments from `sys.argv`. Errors of Hydra are raised
-    as InputError, with a message in one line."""
+    """Run or print the jobs with Hydra, which reads its arguments from `sys.argv`."""
     folder = str(find_packaged_folder("conf"))
     main = hydra.main(config_path=folder, config_name=CONFIG, version_base=VERSION_BASE)
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
@@ -108,8 +107,7 @@ def _collect_failures(
     job: Callable[[DictConfig], object], failures: list[Exception]
 ) -> Callable[[DictConfig], None]:
     """Wrap the job: expected failures are appended to `failures`, so the other jobs of a multirun still run.
-    Some launchers run jobs in other processes; there, failures are raised, and Hydra passes the first one on.
-    """
+    In processes of a launcher, failures are raised, and Hydra passes the first one on."""
     collector = os.getpid()
 
     def train_from_config(cfg: DictConfig) -> None:
@@ -124,8 +122,7 @@ def _collect_failures(
 
 
 def run_training(cfg: DictConfig) -> Outcome | None:
-    """Finish the run of a checked config, print the results, and return the outcome; None in the additional
-    processes of distributed training."""
+    """Finish a config's run, and print the results. Return None in additional processes of torchrun."""
     from memmlp.cli.train_summary import show
     from memmlp.config.build_request import build_request
     from memmlp.training.request import find_finished_outcome

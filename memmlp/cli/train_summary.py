@@ -11,12 +11,7 @@ from rich.text import Text
 from memmlp.common.processes import MIN_CORE_FRACTION
 from memmlp.common.text_formats import make_console
 from memmlp.evaluation.metric_facts import AUTHORS, UNITS
-from memmlp.report.tables.measured_run import (
-    CORE_FRACTION_KEYS,
-    Errors,
-    MeasuredRun,
-    load_measured_run,
-)
+from memmlp.report.tables.measured_run import CORE_FRACTION_KEYS, Errors, MeasuredRun, load_measured_run
 from memmlp.report.tables.table_text import describe_missing_clips
 from memmlp.runs.deployment_folder import (
     MAX_GROWTH,
@@ -50,12 +45,10 @@ def show(outcome: Outcome) -> None:
 
 
 def format_warning(line: str) -> Text:
-    """Return the line in yellow."""
     return Text(line, style="yellow")
 
 
 def list_run_warnings(run: Run) -> Iterator[str]:
-    """Yield warnings about a run with incomplete data, changed code, or too little training."""
     if partial := run.manifest.get("partial"):
         yield f"incomplete data: {partial}"
     if changed := run.changed_sources:
@@ -69,7 +62,6 @@ def list_run_warnings(run: Run) -> Iterator[str]:
 
 
 def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
-    """Yield lines about the time per frame in the requested exported file, and the network's size."""
     measured, precision = select_deployed_measurements(record), find_deployed_precision(record)
     lower = precision != "fp32"
     file = f" in {precision}" if lower else ""
@@ -102,7 +94,6 @@ def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
 
 
 def describe_stages(outcome: Outcome) -> str:
-    """Return a line that lists the stages of this call and the stages that were finished before."""
     if not outcome.new_stages:
         return f"run {outcome.run.id} is finished already; nothing was done (force=true repeats it)"
     stages = [stage for stage in STAGES if stage != "deployment" or "latency" in outcome.results]
@@ -112,8 +103,7 @@ def describe_stages(outcome: Outcome) -> str:
 
 
 def make_all_metrics_tables(run: Run, results: Errors, stages: Sequence[str]) -> Iterator[Table]:
-    """Yield a table of the metrics (means by mode, branch and metric) on all test clips, and one for each
-    source if there are several. `stages` are the identities of the evaluations to show."""
+    """Yield a table of the metrics on all test clips, and one for each source if there are several."""
     measured = load_measured_run(run.folder, stages)
     yield make_metrics_table(replace(measured, means=results))
     for source, part in measured.split_by_source().items():
@@ -121,33 +111,20 @@ def make_all_metrics_tables(run: Run, results: Errors, stages: Sequence[str]) ->
 
 
 def make_metrics_table(measured: MeasuredRun, title: str = "test clips") -> Table:
-    """Make a table of the metrics on test clips, with a column for each mode and branch. A mean over a part
-    of the clips is marked."""
+    """Make a table with a column for each mode and branch. A mean over a part of the clips is marked."""
     means = measured.means
-    columns = [(mode, branch) for mode, branch in MODES_AND_BRANCHES if branch in means.get(mode, {})]
-    headers = [f"{mode}\n{branch}" for mode, branch in columns]
-    errors = [means[mode][branch] for mode, branch in columns]
-    parts = [
-        {metric: describe_missing_clips(*measured.count_clips(*column, metric)) for metric in own}
-        for column, own in zip(columns, errors, strict=True)
-    ]
-    return _make_error_table(title, headers, errors, parts, padding=(0, 1, 0, 0))
-
-
-def _make_error_table(
-    title: str,
-    headers: Sequence[str],
-    errors: Sequence[Mapping[str, Any]],
-    notes: Sequence[Mapping[str, str]] | None = None,
-    **style: Any,
-) -> Table:
-    columns = [Column("metric"), Column("unit"), *(Column(header, justify="right") for header in headers)]
-    table = Table(*columns, title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, **style)
+    shown = [(mode, branch) for mode, branch in MODES_AND_BRANCHES if branch in means.get(mode, {})]
+    columns = [Column("metric"), Column("unit")]
+    columns += [Column(f"{mode}\n{branch}", justify="right") for mode, branch in shown]
+    style: dict[str, Any] = {"box": SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
+    table = Table(*columns, title=title, title_justify="left", **style)
     for metric, unit in UNITS.items():
-        values = [column.get(metric) for column in errors]
+        values = [means[mode][branch].get(metric) for mode, branch in shown]
         if any(value is not None for value in values):  # not every column has custom metrics
-            added = [column.get(metric, "") for column in notes or [{}] * len(errors)]
-            pairs = zip(values, added, strict=True)
-            numbers = ("-" if value is None else f"{float(value):.2f}{note}" for value, note in pairs)
+            counts = [measured.count_clips(mode, branch, metric) for mode, branch in shown]
+            numbers = (
+                "-" if value is None else f"{float(value):.2f}{describe_missing_clips(*count)}"
+                for value, count in zip(values, counts, strict=True)
+            )
             table.add_row(metric, unit, *numbers)
     return table

@@ -10,15 +10,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import PATH, outputs_option, plugins_option
+from memmlp.cli.options import add_run_options, config_dir_option
 from memmlp.cli.workers import Workers, add_worker_options, start_fleet
+from memmlp.common.components import find_chosen_settings
 from memmlp.common.errors import InputError
+from memmlp.common.files import digest, find_packaged_folder, write_json
 from memmlp.common.lease import Lock
 from memmlp.common.overrides import Override
-from memmlp.common.text_formats import join_command
+from memmlp.common.text_formats import join_command, make_console
+from memmlp.config.compose_plan import make_tasks
+from memmlp.config.plugins import activate, find_named_packages, format_config_dir
+from memmlp.runs.identity import affects_training, select_inference_config, select_validation_config
+from memmlp.sweep.plan import Plan, RunTask
 
 if TYPE_CHECKING:
-    from memmlp.sweep.plan import RunTask
     from memmlp.sweep.search.search_file import Search, Value
     from memmlp.sweep.search.study import Study
     from memmlp.training.request import RunRequest
@@ -28,12 +33,9 @@ if TYPE_CHECKING:
 @click.argument("overrides", nargs=-1)
 @add_worker_options
 @click.option("--status", is_flag=True, help="Only show the search's progress.")
-@click.option("--config-dir", type=PATH, help="Folder of more configs; they can name your own classes.")
-@plugins_option
-@outputs_option
-def tune(
-    overrides: tuple[str, ...], workers: Workers, status: bool, config_dir: Path | None, outputs: Path
-) -> None:
+@config_dir_option
+@add_run_options
+def tune(overrides: tuple[str, ...], workers: Workers, status: bool, outputs: Path) -> None:
     """Search the manual loss weights: first the paper's weights, then Optuna's proposals.
 
     OVERRIDES can be overrides of `memmlp train` for all trials, settings of the executor as in `memmlp
@@ -42,12 +44,12 @@ def tune(
     training, or `+search.space.optim.lr={low: 1e-4, high: 1e-2,
     log: true}`. `search=NAME` selects conf/search/NAME.yaml. A restarted search continues where it stopped.
     """
-    from memmlp.common.files import write_json
+    from memmlp.sweep.search import results
     from memmlp.sweep.search.study import Study
 
     if workers.executor == "debug":  # the search would wait for trials in its own process
         raise InputError("executor=debug: expected local or slurm for a search")
-    setup = prepare_search(overrides, config_dir, outputs.absolute())
+    setup = prepare_search(overrides, outputs.absolute())
     if status:
         show(setup)
         return
@@ -56,19 +58,19 @@ def tune(
         write_json(setup.folder / "search.json", about)
         study = Study.open(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)
-        write_results(setup, study)
+        results.write_trials(study, setup.folder / "trials.csv")
+        groups = [path.name for path in find_packaged_folder("conf").iterdir() if path.is_dir()]
+        results.write_experiments(study, setup.folder, groups)
     print_summary(setup, study)
 
 
 class SearchSetup(NamedTuple):
-    """A search, its folder, and the settings of its runs: the command line's overrides for all trials, the
-    folder of runs and caches, and a folder of custom configs, or None."""
+    """A search with its folder, the overrides for all trials, and the folder of runs and caches."""
 
     search: Search
     command_line: tuple[str, ...]
     outputs: Path
     folder: Path
-    config_dir: Path | None
 
     def list_overrides(self, values: Mapping[str, Value]) -> list[str]:
         """Return a trial's overrides: those of the search file and the command line, then the trial's values.
@@ -76,22 +78,14 @@ class SearchSetup(NamedTuple):
         fixed = ["export.graph=off", *self.search.budget, *self.search.base]
         return [*fixed, *self.command_line, *self.search.overrides(values)]
 
-    @property
-    def config_options(self) -> list[str]:
-        """The command-line options for the custom configs."""
-        return ["--config-dir", str(self.config_dir)] if self.config_dir else []
 
-
-def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: Path) -> SearchSetup:
-    """Return the search of a command line. Raises InputError if a key or range does not fit the config."""
-    from memmlp.common.files import digest
+def prepare_search(overrides: Sequence[str], outputs: Path) -> SearchSetup:
     from memmlp.config.compose import compose_plain
-    from memmlp.config.plugins import activate, find_named_packages
     from memmlp.sweep.search.search_file import Search, parse_search, read_best_trial
 
     activate(find_named_packages(overrides))
     own = [text for text in overrides if Override.parse(text).group == "search"]
-    content = compose_plain("tune", own, config_dir).get("search")
+    content = compose_plain("tune", own).get("search")
     if not isinstance(content, dict):
         raise InputError("search: must be the name of a file in conf/search")
     activate(find_named_packages(map(str, content.get("base") or ())))
@@ -102,7 +96,7 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
         overrides_before, best = read_best_trial(Path(folder))
         content["base"] = [*overrides_before, *Search.overrides(best), *(content.get("base") or ())]
     parsed = parse_search(content, best)
-    setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name, config_dir)
+    setup = SearchSetup(parsed, remaining, outputs, outputs / "tune" / parsed.name)
     base = _check_space(setup)
     if not _make_requests(setup, {})[0].motion.prepare().has("val"):
         raise InputError("data.split.val: must be above 0 for a search, which ranks trials on validation")
@@ -112,7 +106,6 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
 
 def _complete_kinematic_loss(content: dict[str, Any], overrides: Sequence[str]) -> None:
     """Replace the choice `kinematic` of the loss by the network's own overrides for it."""
-    from memmlp.common.components import find_chosen_settings
     from memmlp.config.compose import compose_config
 
     match content:
@@ -125,12 +118,7 @@ def _complete_kinematic_loss(content: dict[str, Any], overrides: Sequence[str]) 
 def _check_space(setup: SearchSetup) -> str:
     """Check the ranges of a search, and return a text with everything that affects the results of its trials:
     the first trial's run, its validation interval, its inference settings, and the component versions at the
-    limits of the space. The folder name of the search contains a digest of this text, so a search with
-    another config or data has another folder. Raises InputError if a searched key is set on the command line
-    or does not affect training, or if the config rejects a value."""
-    from memmlp.common.files import digest
-    from memmlp.runs.identity import affects_training, select_inference_config, select_validation_config
-
+    limits of the space. The search's folder is named by its digest."""
     space = setup.search.space
     for override in map(Override.parse, setup.command_line):
         if override.key in {one.key for one in space}:
@@ -145,15 +133,14 @@ def _check_space(setup: SearchSetup) -> str:
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
     configs = [request.config for request in requests]
-    first_validation = select_validation_config(configs[0])
-    for config in configs[1:]:
-        other = select_validation_config(config)
-        for key in sorted(first_validation.keys() | other.keys()):
-            if first_validation.get(key) != other.get(key):
-                raise InputError(
-                    f"search.space: {key} changes the validation clips of the trials; keys of data must be "
-                    "weighting, mirror, split.train_fraction or sources.NAME.weight"
-                )
+    first_validation, *others = map(select_validation_config, configs)
+    for other in others:
+        changed = [key for key in first_validation | other if first_validation.get(key) != other.get(key)]
+        if changed:
+            raise InputError(
+                f"search.space: {min(changed)} changes the validation clips of the trials; keys of data must "
+                "be weighting, mirror, split.train_fraction or sources.NAME.weight"
+            )
     for one in space:
         # Some keys change the training only at values other than 0.
         counts = any(affects_training(one.key, config) for config in configs)
@@ -167,8 +154,6 @@ def _check_space(setup: SearchSetup) -> str:
 
 
 def _make_tasks(setup: SearchSetup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
-    from memmlp.config.compose_plan import make_tasks
-
     requests = _make_requests(setup, values)
     return [make_tasks(request, request.motion.prepare().digest) for request in requests]
 
@@ -177,14 +162,12 @@ def _make_requests(setup: SearchSetup, values: Mapping[str, Value]) -> list[RunR
     from memmlp.config.build_request import build_requests
     from memmlp.config.compose import compose_checked
 
-    checked = compose_checked([*setup.config_options, *setup.list_overrides(values)])
+    checked = compose_checked(setup.list_overrides(values))
     first = checked.resolved["seed"]
     return list(build_requests(checked, setup.outputs, range(first, first + setup.search.seeds)))
 
 
 def show(setup: SearchSetup) -> None:
-    """Print the progress of the search."""
-    from memmlp.common.text_formats import make_console
     from memmlp.sweep.search.progress_table import render
     from memmlp.sweep.search.study import Study
 
@@ -193,18 +176,15 @@ def show(setup: SearchSetup) -> None:
 
 
 def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
-    """Run the study until it has all trials of the search."""
-    from memmlp.sweep.plan import Plan
     from memmlp.sweep.search.director import Director, run_search
     from memmlp.sweep.search.progress_table import SearchBoard
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
     base = _make_requests(setup, {})[0]
-    digest = base.motion.prepare().digest
+    digest_at_start = base.motion.prepare().digest
 
     def check() -> None:
-        """Raise InputError if the data has changed, because further trials would be judged on other clips."""
-        if base.motion.prepare().digest != digest:
+        if base.motion.prepare().digest != digest_at_start:
             raise InputError(
                 f"{base.motion.clips.root}: clips have changed since the search started; restore them, or "
                 "start a new search"
@@ -215,22 +195,10 @@ def search(setup: SearchSetup, study: Study, workers: Workers) -> None:
     run_search(director, fleet, SearchBoard(setup.outputs), path)
 
 
-def write_results(setup: SearchSetup, study: Study) -> None:
-    """Write the results of the search into its folder."""
-    from memmlp.common.files import find_packaged_folder
-    from memmlp.sweep.search import results
-
-    results.write_trials(study, setup.folder / "trials.csv")
-    groups = [path.name for path in find_packaged_folder("conf").iterdir() if path.is_dir()]
-    results.write_experiments(study, setup.folder, groups)
-
-
 def print_summary(setup: SearchSetup, study: Study) -> None:
-    """Print the best trials, the importance of the keys, the folder, and the next command. Exits with 1 if no
-    trial is complete."""
+    """Print the best trials and the next command. Exits with 1 if no trial is complete."""
     from rich.text import Text
 
-    from memmlp.common.text_formats import make_console
     from memmlp.sweep.search.progress_table import (
         add_row,
         describe_counts,
@@ -268,7 +236,7 @@ def print_summary(setup: SearchSetup, study: Study) -> None:
     if best:
         unmeasured = 2 if setup.search.budget else 1  # the first overrides leave out export and evaluation
         words = setup.list_overrides(get_values(best[0], setup.search))[unmeasured:]
-        click.echo("next: " + join_command(["memmlp", "train", *setup.config_options, *words]))
+        click.echo("next: " + join_command(["memmlp", "train", *format_config_dir(), *words]))
     else:
         reasons = [trial.user_attrs["reason"] for trial in study.trials if "reason" in trial.user_attrs]
         click.echo(f"no trial is complete; last failure: {(reasons or ['NaN errors'])[-1]}")

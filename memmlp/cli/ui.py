@@ -11,27 +11,22 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import (
-    HomePath,
-    add_page_options,
-    host_option,
-    outputs_option,
-    plugins_option,
-    token_option,
-)
+from memmlp.cli.options import HomePath, add_page_options, add_run_options
+from memmlp.cli.table import write
+from memmlp.common.errors import InputError
+from memmlp.common.page_server import check_token
+from memmlp.common.text_formats import join_command
+from memmlp.runs.environment import describe_environment
+from memmlp.runs.identity import NETWORK
+from memmlp.runs.run import Run
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from memmlp.runs.run import Run
-
 
 @click.command("ui")
 @add_page_options(port=8787)
-@host_option
-@token_option
-@plugins_option
-@outputs_option
+@add_run_options
 def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path) -> None:
     """Show runs, sweeps and searches on a local web page, with live updates.
 
@@ -39,7 +34,6 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
     """
     import webbrowser
 
-    from memmlp.common.page_server import check_token
     from memmlp.report.ui.server import Answers, RunsServer
 
     check_token(host, token)
@@ -54,11 +48,8 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
 
 
 def make_command(run: Run) -> str:
-    """Return the command that trains a network's run again. Raises InputError if it cannot."""
-    from memmlp.common.errors import InputError
-    from memmlp.common.text_formats import join_command
+    """Return the command that trains a network's run again."""
     from memmlp.config.build import list_overrides
-    from memmlp.runs.identity import NETWORK
 
     if run.manifest.get("kind") != NETWORK:
         raise InputError(f"run {run.id}: has the command of the runs that need it")
@@ -70,11 +61,9 @@ _compose_lock = threading.Lock()  # Hydra composes one config at a time
 
 
 def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
-    """Return a run's prediction for a test clip (`make_prediction_arrays`), computed on one CPU thread.
-    Raises InputError if the run's data is not prepared on this machine, or does not contain the clip."""
+    """Return a run's prediction for a test clip (`make_prediction_arrays`), computed on one CPU thread."""
     import torch
 
-    from memmlp.common.errors import InputError
     from memmlp.config.open_run import OpenedRun, build_run_experiment, find_clip, load_run_data
     from memmlp.evaluation.predictions import predict_clip
 
@@ -92,26 +81,20 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
 @click.argument("sweeps", nargs=-1)
 @click.option("--out", type=HomePath(dir_okay=False), help="HTML file.  [default: report.html in --outputs]")
 @click.option("--no-replays", is_flag=True, help="Write a smaller file, without 3D replays of clips.")
-@plugins_option
-@outputs_option
+@add_run_options
 def report(sweeps: tuple[str, ...], out: Path | None, no_replays: bool, outputs: Path) -> None:
     """Write the page of `memmlp ui` as one file, which works offline.
 
     SWEEPS are sweep files, numbers of the paper's tables, or folders in outputs/sweeps. The default is all
     sweeps. The file contains the runs and tables of these sweeps, and all searches.
     """
-    from memmlp.cli.table import write
     from memmlp.report.ui.report_file import write_page
     from memmlp.report.ui.server import Answers
-    from memmlp.runs.environment import describe_environment
 
     facts = describe_environment()
     git = facts["git"] or {}
     code = f"{git.get('commit', facts['version'])[:7]}{' with changes' if git.get('dirty') else ''}"
     about = datetime.now(UTC).strftime(f"Generated %Y-%m-%d %H:%M UTC, code {code}")
-    answers = Answers(outputs, predict)
-    try:
+    with contextlib.closing(Answers(outputs, predict)) as answers:
         text = write_page(answers, sweeps, about, not no_replays)
-    finally:
-        answers.close()
     write(out or outputs / "report.html", text)

@@ -7,14 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import (
-    PATH,
-    FiniteFloat,
-    check_runs_exist,
-    outputs_option,
-    plugins_option,
-    warn_about_training,
-)
+from memmlp.cli.options import PATH, FiniteFloat, add_run_options, check_runs_exist, warn_about_training
+from memmlp.common.errors import InputError
+from memmlp.common.overrides import flatten
+from memmlp.runs.lookup import count_training_frames, get_run_name, warn_if_hardly_trained
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -31,8 +27,7 @@ if TYPE_CHECKING:
     type=FiniteFloat(1, 600),
     help="Maximum length of a clip in seconds; longer clips are cut to their middle.",
 )
-@plugins_option
-@outputs_option
+@add_run_options
 def web(runs: tuple[str, ...], out: Path, clips: int, seconds: float, outputs: Path) -> None:
     """Make a static web site of finished RUNS (ids, beginnings of ids, or folders).
 
@@ -40,7 +35,6 @@ def web(runs: tuple[str, ...], out: Path, clips: int, seconds: float, outputs: P
     the time of each pose (docs/guides/web.md). The first call downloads onnxruntime-web from npm's registry.
     """
     check_runs_exist(outputs, *runs)
-    from memmlp.common.errors import InputError
     from memmlp.config.open_run import open_run
     from memmlp.live.web.site import Site, check_site_folder
 
@@ -60,7 +54,7 @@ def web(runs: tuple[str, ...], out: Path, clips: int, seconds: float, outputs: P
 
 
 def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
-    """Return the middle parts of up to `count` test clips of a run, evenly spaced in the list of clips."""
+    """Return the middle parts of up to `count` test clips, evenly spaced in the list of clips."""
     import numpy as np
 
     from memmlp.live.web.site import pack_clip
@@ -71,11 +65,8 @@ def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 
 
 def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
-    """Return a run's network with the facts that the site shows."""
-    from memmlp.common.overrides import flatten
     from memmlp.live.web.site import SiteNetwork
     from memmlp.networks.streaming import check_is_stream
-    from memmlp.runs.lookup import count_training_frames, get_run_name, warn_if_hardly_trained
 
     network = opened.network()
     check_is_stream(network)

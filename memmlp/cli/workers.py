@@ -15,12 +15,14 @@ import click
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import Override
 from memmlp.common.processes import count_usable_cores
+from memmlp.config.plugins import import_object
+from memmlp.sweep.executors.slurm import Slurm, format_batch_script, parse_slurm_options
+from memmlp.sweep.plan import Plan
 
 if TYPE_CHECKING:
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.executors import Executor
     from memmlp.sweep.executors.local import GpuGroup
-    from memmlp.sweep.plan import Plan
 
 EXECUTORS = ("local", "slurm", "debug")  # debug runs everything in this process, for debuggers
 DEVICES_WITHOUT_GPU = {"cpu", "mps"}  # devices that do not need a CUDA GPU
@@ -45,34 +47,24 @@ class Workers:
         for option, value in given.items():
             if value is not None and self.executor != "local":
                 raise InputError(f"{option}: needs workers of this machine, executor=local")
-        self.parse_options()
-
-    def parse_options(self) -> Any:
-        """Parse and check the executor's settings. Raises InputError for a wrong setting."""
-        if self.executor != "slurm":
-            return None
-        from memmlp.sweep.executors.slurm import parse_slurm_options
-
-        return parse_slurm_options(self.settings)
+        if self.executor == "slurm":
+            parse_slurm_options(self.settings)  # raises InputError for a wrong setting
 
     def make_batch_script(self, folder: Path) -> str:
         """Return the batch file for sbatch; an empty text for executors other than Slurm."""
         if self.executor != "slurm":
             return ""
-        from memmlp.sweep.executors.slurm import format_batch_script
-
-        return format_batch_script(get_log_path(folder), self.parse_options(), self.count_workers())
+        options = parse_slurm_options(self.settings)
+        return format_batch_script(get_log_path(folder), options, self.count_workers())
 
     def count_workers(self, shares: Sequence[GpuGroup] = ()) -> int:
-        """Return the number of concurrent workers, given their shares of this machine's GPUs."""
         from memmlp.sweep.executors.local import count_workers
 
         return count_workers(shares, self.count, self.workers_per_gpu)
 
     def make_gpu_shares(self, devices: Iterable[str]) -> list[GpuGroup]:
-        """Divide this machine's GPUs into shares for local workers, for runs with these values of the key
-        `device`. Raises InputError if a run requests a GPU that its worker cannot use; the message names the
-        key."""
+        """Divide this machine's GPUs into shares for local workers. Raises InputError without a usable
+        GPU."""
         from memmlp.sweep.executors.local import divide_gpus, list_visible_gpus
 
         gpu_devices = [name for name in devices if name not in DEVICES_WITHOUT_GPU]
@@ -91,14 +83,9 @@ class Workers:
         return divide_gpus(gpus, self.gpus_per_worker)
 
     def start_executor(self, folder: Path, shares: Sequence[GpuGroup]) -> Executor:
-        """Make the executor. Its workers write logs in `folder`/workers, and share this machine's GPUs."""
         if self.executor == "slurm":
-            from memmlp.sweep.executors.slurm import Slurm
-
-            return Slurm(get_log_path(folder), self.parse_options())
+            return Slurm(get_log_path(folder), parse_slurm_options(self.settings))
         if "." in self.executor:
-            from memmlp.config.plugins import import_object
-
             return import_object(self.executor, "executor")(get_log_path(folder), self.settings)
         from memmlp.sweep.executors.local import DebugExecutor, LocalExecutor
 
@@ -111,8 +98,7 @@ def get_log_path(folder: Path) -> Path:
 
 
 def add_worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the worker options to a command, which receives their values as `workers`, and the overrides
-    without those of the executor as `overrides`."""
+    """Add the worker options to a command, which gets `workers`, and `overrides` without the executor's."""
     options = (
         click.option(
             "--workers",
@@ -151,8 +137,7 @@ def add_worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple[str, ...]]:
-    """Split overrides into the executor's name, its settings, and the remaining overrides. Raises InputError
-    for an unknown executor, or settings of another executor."""
+    """Split overrides into the executor's name, its settings, and the remaining overrides."""
     executor, executor_settings, remaining = "local", [], []
     for override in map(Override.parse, overrides):
         if override.key == "executor":
@@ -173,9 +158,7 @@ def split_executor(overrides: Iterable[str]) -> tuple[str, dict[str, str], tuple
 
 def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> tuple[Path, Fleet]:
     """Save the plan in a new file, and return the file and a fleet of workers for it, none of which is
-    started. Each process that works on the same sweep has a separate file, so it cannot change the plan of
-    another process's workers. Raises InputError if workers cannot get the GPUs that the runs' `devices`
-    request."""
+    started. Each controller has a separate file, so it cannot change the plan of another one's workers."""
     from memmlp.config.worker_process import work
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import write_process_file

@@ -32,17 +32,8 @@ PLAIN = re.compile(r"dataclasses|typing|collections\.abc|math|memmlp\.common\.co
 """The modules that are really imported when declarations are read."""
 
 SLOTS = (
-    "model",
-    "memory",
-    "predictor",
-    "rollout",
-    "loss",
-    "hand",
-    "term",
-    "refiner",
-    "prerequisite",
-    "optim",
-)
+    "model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner", "prerequisite", "optim",
+)  # fmt: skip
 """The config groups from which a network and its training are composed."""
 
 _Kind = TypeVar("_Kind", bound=Callable[..., Any])
@@ -150,8 +141,7 @@ def collect_attribute(kind: type[Settings], attribute: str) -> dict[str, Any]:
 
 @functools.cache
 def collect_components() -> dict[tuple[str, str], Component]:
-    """Return all components by slot and name, including those of users' packages. Raises InputError if two
-    packages declare the same option."""
+    """Return all components by slot and name. Raises InputError if two packages declare the same option."""
     components: dict[tuple[str, str], Component] = {}
     for package, root in _roots.items():
         for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:

@@ -21,10 +21,8 @@ T = TypeVar("T")
 TIMEOUT = timedelta(days=7)  # others wait while the first process prepares, validates or evaluates
 
 
-class _Step:
-    """The state of this process: whether it works on a slice of the batch."""
-
-    shared = False
+_split = False
+"""Whether this process works on its own rows of a batch."""
 
 
 def world_size() -> int:
@@ -83,26 +81,27 @@ def broadcast(value: T) -> T:
 @contextlib.contextmanager
 def split_batch() -> Iterator[None]:
     """In this context, batches are split: each process works on its own rows."""
-    _Step.shared = world_size() > 1
+    global _split
+    _split = world_size() > 1
     try:
         yield
     finally:
-        _Step.shared = False
+        _split = False
 
 
 def is_batch_split() -> bool:
     """Return whether this process works on its own rows of a batch, inside `split_batch()`."""
-    return _Step.shared
+    return _split
 
 
 def take_local_rows(batch: Tensor) -> Tensor:
     """Return this process' rows of a whole batch (B, ...); B is a multiple of the number of processes."""
-    return batch.chunk(world_size())[rank()] if _Step.shared else batch
+    return batch.chunk(world_size())[rank()] if _split else batch
 
 
 def gather_rows(rows: Tensor) -> Tensor:
     """Concatenate the rows (b, ...) of all processes to the whole batch (B, ...), without gradients."""
-    if not _Step.shared:
+    if not _split:
         return rows
     import torch
     from torch import distributed
@@ -114,9 +113,8 @@ def gather_rows(rows: Tensor) -> Tensor:
 
 def draw_rows(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     """Draw random numbers for the whole batch, like a single process would, and return this process' rows.
-    `draw` gets a tensor with the shape of the whole batch; `like` has the shape (b, ...) of this process'
-    rows."""
-    if not _Step.shared:
+    `draw` gets a tensor with the shape of the whole batch; `like` has the shape (b, ...) of these rows."""
+    if not _split:
         return draw(like)
     return take_local_rows(draw(like.detach().repeat(world_size(), *[1] * (like.dim() - 1))))
 

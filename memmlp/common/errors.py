@@ -1,8 +1,10 @@
 """The errors that the command line turns into one line and an exit code."""
 
+import difflib
 import errno
 import importlib
 import unicodedata
+from collections.abc import Iterable
 from importlib.util import find_spec
 from types import ModuleType
 
@@ -16,11 +18,16 @@ def escape_line_breaks(text: str) -> str:
 
 class InputError(ValueError):
     """Bad user input; the message names the file or key, the problem and the expected input. The command line
-    prints it without a traceback and exits with code 2. Line breaks, for example from file names, are
-    escaped."""
+    prints it, in one line, and exits with code 2."""
 
     def __init__(self, message: str) -> None:
         super().__init__(escape_line_breaks(message))
+
+
+def suggest(word: str, options: Iterable[str]) -> str:
+    """Return "did you mean X? " for the option that is most similar to a word; empty without one."""
+    near = difflib.get_close_matches(word, list(options), n=1)
+    return f"did you mean {near[0]}? " if near else ""
 
 
 def describe_read_error(error: Exception) -> str:
@@ -39,21 +46,19 @@ def check_installed(package: str, extra: str, purpose: str) -> None:
 
 
 def import_optional(module: str, extra: str, purpose: str) -> ModuleType:
-    """Import and return a module of an optional package that the extra `extra` of memmlp installs. `purpose`
-    is the override, option or file that needs it; the message begins with it. Raises InputError without the
-    package."""
+    """Import and return a module of a package that the extra `extra` installs. `purpose` is the override,
+    option or file that needs it. Raises InputError without the package."""
     check_installed(module.split(".")[0], extra, purpose)
     return importlib.import_module(module)
 
 
 class TrainingDiverged(RuntimeError):
-    """The loss became NaN or infinite. The one-line message has the step, the loss term and the batch's
-    clips. The exit code is 1."""
+    """The loss became NaN or infinite. The message names the step, loss term and clips. The exit code is
+    1."""
 
 
 class RunStopped(Exception):
-    """Somebody asked for the end of a run's work; its checkpoint is written. The message is one line; the
-    exit code is 1."""
+    """Somebody asked for the end of a run's work; its checkpoint is written. The exit code is 1."""
 
 
 class LeaseLost(RuntimeError):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import memmlp
+from memmlp.common.lease import publish, temporary_path
 
 
 def find_packaged_folder(name: str) -> Path:
@@ -59,8 +60,6 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing under a temporary name; it is synced and renamed once it is complete, even if
     the machine crashes. Raises LeaseLost if this process lost its lease of the file's folder."""
-    from memmlp.common.lease import publish, temporary_path  # quicker for commands that only read
-
     unfinished = temporary_path(path)
     try:
         with naming_file(path), open(unfinished, "wb") as file:

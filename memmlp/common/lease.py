@@ -140,8 +140,8 @@ class Claim(NamedTuple):
         return None
 
     def can_be_taken_over(self, idle: float) -> bool | None:
-        """Return whether another process may claim the folder, idle for `idle` seconds; None if it must wait
-        for the whole LEASE."""
+        """Return whether another process may claim the folder after `idle` seconds; None if it must wait for
+        LEASE."""
         alive = is_alive(self.owner) if self.owner else None
         if self.free or alive is False or idle > LEASE:
             return True
@@ -157,11 +157,10 @@ class Lock:
         self.description = f"{self.target.parent.name.removesuffix('s')} {self.target.name}"
 
     @contextlib.contextmanager
-    def hold(self, report: Callable[[str], None] | None = None, wait: bool = True) -> Iterator[Lease | None]:
+    def hold(self, wait: bool = True) -> Iterator[Lease | None]:
         """Hold the lock during the context, and yield the lease; without `wait`, None if another process
-        holds the lock. If another process takes over the folder, any attempt of this process to publish a
-        file there raises LeaseLost. `report` gets a line if this process has to wait; by default, the line
-        goes to stderr."""
+        holds the lock. If another process takes over the folder, publishing a file there raises LeaseLost.
+        If this process has to wait, it prints a line to stderr."""
         key, thread = _resolve_folder(self.target), (os.getpid(), threading.get_ident())
         if key in _leases and _leases[key].thread == thread:
             yield _leases[key]
@@ -169,8 +168,9 @@ class Lock:
         self.folder.mkdir(parents=True, exist_ok=True)
         lease = self._try_to_claim()
         if lease is None and wait:
-            line = f"{self.description} is in use by {self.holder_description}; waiting until it is free"
-            (report or _print_to_stderr)(line)
+            holder = self.holder_description
+            line = f"memmlp: {self.description} is in use by {holder}; waiting until it is free"
+            print(line, file=sys.stderr, flush=True)
             while (lease := self._try_to_claim()) is None:
                 time.sleep(PAUSE)
         if lease is None:
@@ -266,8 +266,7 @@ class Lock:
 
 
 class Lease:
-    """This process' claim on a folder. `lost` is set once this process knows that another one has
-    taken over."""
+    """This process' claim on a folder. `lost` is set once it knows that another process has taken over."""
 
     def __init__(self, lock: Lock, number: int, path: Path):
         self.lock, self.number, self.path, self.lost = lock, number, path, False
@@ -336,7 +335,6 @@ def publish(unfinished: Path, path: Path) -> None:
 
 
 def _remove_unfinished(folder: Path, number: int) -> None:
-    """Remove the unfinished files that owners with lower numbers left in a folder and beside it."""
     for path in [*folder.rglob(".*.lease-*.tmp"), *folder.parent.glob(f".{folder.name}.lease-*.tmp")]:
         owner = re.search(r"\.lease-(\d+)\.[0-9a-f]+\.tmp$", path.name)
         if owner is None or int(owner[1]) >= number:  # of a later owner
@@ -356,7 +354,3 @@ def _find_lease(path: Path) -> Lease | None:
 def _resolve_folder(path: Path) -> Path:
     """Return the path with links in its parent folder resolved; a link at its end is kept."""
     return Path(os.path.realpath(path.parent)) / path.name
-
-
-def _print_to_stderr(line: str) -> None:
-    print(f"memmlp: {line}", file=sys.stderr, flush=True)

@@ -27,8 +27,7 @@ MAX_SIZE = 300_000_000  # bytes of a tarball
 
 @dataclass(frozen=True)
 class Package:
-    """An npm package with a pinned version, and the tarball's digest in npm's format ("sha512-" and
-    base 64)."""
+    """An npm package with a pinned version and npm's digest of its tarball (sha512-BASE64)."""
 
     name: str
     version: str
@@ -62,11 +61,6 @@ ONNXRUNTIME_WEB = Package(
     "1.30.0",
     "sha512-q0y+JrrtukXSzsBWEMccVfqX25LRmosXHF+CaRJmg8pZClzcV7svNc4rKY3jL02Vb7QmRMDs1SigqR4CXAfKYQ==",
 )
-IWER = Package(  # a headset in software, for tests
-    "iwer",
-    "2.5.0",
-    "sha512-grq7iMyWo4s2DYnATKLPPoAByhcNuwLjMHHOILrFU9q8EGHIEzHyUuq1mz+9Xqy6+xrYPn3Ho8Z9eymZCE+D6w==",
-)
 
 
 def read_package_files(package: Package, names: Collection[str]) -> dict[str, bytes]:
@@ -86,8 +80,7 @@ def read_package_files(package: Package, names: Collection[str]) -> dict[str, by
 
 
 def fetch_tarball(package: Package) -> Path:
-    """Return a package's tarball, downloading it if it is not in the cache. Raises InputError if it can't be
-    downloaded, or does not have the pinned digest."""
+    """Return a package's tarball. Raises InputError if it can't be downloaded, or has another digest."""
     if (given := os.environ.get(FOLDER)) and (path := Path(given) / package.file).is_file():
         if _has_digest(package, path.read_bytes()):
             return path
@@ -108,9 +101,7 @@ def find_cache_folder() -> Path:
 def find_registry_url() -> str:
     """Return the address of the registry."""
     given = (value for name, value in os.environ.items() if name.upper() == "NPM_CONFIG_REGISTRY")
-    if address := next(given, ""):
-        return address
-    return DEFAULT_REGISTRY
+    return next(given, "") or DEFAULT_REGISTRY
 
 
 def _download(package: Package, host: str) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sized
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -20,18 +20,7 @@ INTERVAL = 30.0  # seconds between two progress lines
 
 _label: ContextVar[str] = ContextVar("label of the larger work", default="")
 _file: ContextVar[Path | None] = ContextVar("file of the lines about work", default=None)
-_listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener to lines about work", default=None)
-
-
-def print_to_stderr(line: str) -> None:
-    """Write a line to stderr."""
-    print(line, file=sys.stderr, flush=True)
-
-
-def print_unless_terminal(line: str) -> None:
-    """Write a line to stderr, unless stderr is a terminal: a terminal shows progress bars instead."""
-    if not sys.stderr.isatty():
-        print_to_stderr(line)
+_printed: ContextVar[bool] = ContextVar("whether lines about work are printed", default=False)
 
 
 @contextmanager
@@ -43,11 +32,9 @@ def _set(variable: ContextVar[T], value: T) -> Iterator[None]:
         variable.reset(token)
 
 
-def send_announcements_to(
-    listener: Callable[[str], None] = print_unless_terminal,
-) -> AbstractContextManager[None]:
-    """Send announcements and progress lines of the context to a listener."""
-    return _set(_listener, listener)
+def print_announcements() -> AbstractContextManager[None]:
+    """Print announcements and progress lines of the context to stderr."""
+    return _set(_printed, True)
 
 
 def keep_announcements(path: Path) -> AbstractContextManager[None]:
@@ -55,24 +42,19 @@ def keep_announcements(path: Path) -> AbstractContextManager[None]:
     return _set(_file, path)
 
 
-def _keep(line: str) -> None:
+def announce(line: str, on_terminal: bool = False) -> None:
+    """Print a line, such as the name of the next step, in the context of `print_announcements`. A terminal
+    shows progress bars instead, unless `on_terminal` is set."""
     if path := _file.get():
         with contextlib.suppress(OSError), open(path, "a", encoding="utf-8") as file:
             file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n")
-
-
-def announce(line: str) -> None:
-    """Send a line, such as the name of the next step, to the listener of `send_announcements_to`."""
-    _keep(line)
-    if listener := _listener.get():
-        listener(line)
+    if _printed.get() and (on_terminal or not sys.stderr.isatty()):
+        print(line, file=sys.stderr, flush=True)
 
 
 def notify(line: str) -> None:
-    """Send a line that the user should see, such as skipped files; unlike `announce`, also on a terminal."""
-    _keep(line)
-    if listener := _listener.get():
-        (print_to_stderr if listener is print_unless_terminal else listener)(line)
+    """Print a line that the user should see, such as skipped files; unlike `announce`, also on a terminal."""
+    announce(line, on_terminal=True)
 
 
 def label_progress(name: str) -> AbstractContextManager[None]:
@@ -81,8 +63,8 @@ def label_progress(name: str) -> AbstractContextManager[None]:
 
 
 class ProgressCounter:
-    """Counts the finished items of some work, in a bar at this row of the display. A listener
-    (`send_announcements_to`) gets a line every INTERVAL seconds."""
+    """Counts the finished items of some work, in a bar at this row of the display, and announces the number
+    every INTERVAL seconds."""
 
     def __init__(self, display: Progress, row: TaskID, unit: str = ""):
         self.display, self.row, self.unit = display, row, unit
@@ -106,10 +88,10 @@ class ProgressCounter:
         total = "" if task.total is None else f" of {task.total:.0f}"
         count = f"{task.completed:.0f}{total} {self.unit}".rstrip()
         seconds = task.time_remaining
-        left = ""
+        parts = [count, task.fields["note"]]
         if seconds is not None:
-            left = f"{seconds / 60:.0f} min left" if seconds >= 90 else f"{seconds:.0f} s left"
-        return f"{task.description}: {', '.join(filter(None, (count, task.fields['note'], left)))}"
+            parts.append(f"{seconds / 60:.0f} min left" if seconds >= 90 else f"{seconds:.0f} s left")
+        return f"{task.description}: {', '.join(filter(None, parts))}"
 
 
 @contextmanager
@@ -145,8 +127,7 @@ def show_progress(
 def progress_bar(
     items: Iterable[T], description: str, total: int | None = None, unit: str = ""
 ) -> Iterator[T]:
-    """Yield the items while a progress bar counts them. `total` is their number, if `items` has no length;
-    `unit` is that of the count, such as frames."""
+    """Yield the items while a progress bar counts them. `total` is their number, if `items` has no length."""
     if total is None and isinstance(items, Sized):
         total = len(items)
     with show_progress(description, total, unit=unit) as count:

@@ -58,8 +58,7 @@ def parse_yaml(text: str) -> Any:
 
 
 def check_plain(value: Any, depth: int = MAX_DEPTH) -> None:
-    """Raise ValueError unless a list or mapping is a tree of JSON values with finite 64-bit numbers, at most
-    `depth` levels deep."""
+    """Raise ValueError unless a list or mapping is a tree of JSON values with finite 64-bit numbers."""
     if not isinstance(value, dict | list) or not depth:
         raise ValueError(f"has a {type(value).__name__}" if depth else "nested too deeply")
     if len(value) > MAX_ITEMS:

@@ -31,8 +31,7 @@ def one_of(*words: str) -> Rule:
 
 
 def within(low: float, high: float = math.inf, *words: str, strict: bool = False) -> Rule:
-    """Return the rule that a value must be a finite number within limits (excluded if `strict`), or one of
-    the words."""
+    """Return the rule that a value must be within limits (excluded if `strict`), or one of the words."""
 
     def allows(value: Any) -> bool:
         if not isinstance(value, int | float) or isinstance(value, bool):

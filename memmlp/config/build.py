@@ -58,9 +58,8 @@ from memmlp.training.train_refiner import RefinerTraining
 
 
 def build_experiment(cfg: DictConfig, remote: bool = False) -> Experiment:
-    """Build the experiment of a checked config. With `remote`, this process does not train it, so the
-    config's device may be missing here. Raises InputError if the device, or the code of a custom component,
-    is missing."""
+    """Build the experiment of a checked config. With `remote`, the device may be missing here. Raises
+    InputError if the device, or the code of a custom component, is missing."""
     unrefined = None
     if cfg.refiner is not None and not cfg.imported_weights:
         bare = cfg.copy()
@@ -91,9 +90,8 @@ def build_experiment(cfg: DictConfig, remote: bool = False) -> Experiment:
 
 
 def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Training, ...]:
-    """Build the trainings of the prerequisite runs that a checked config (also given as plain dictionaries)
-    needs, in order; none for a refiner, which needs only the run of its network,
-    or imported weights."""
+    """Build the trainings of the prerequisite runs, in order, that a checked config (also given as plain
+    dictionaries) needs. A refiner needs only the run of its network."""
     if cfg.refiner is not None or cfg.imported_weights:
         return ()
     if cfg.prerequisite is not None:
@@ -130,15 +128,13 @@ def build_untrained(overrides: Sequence[str]) -> MotionModel:
 def build_loggers(cfg: DictConfig) -> Loggers:
     """Build the loggers of a config, such as TensorBoard."""
     outputs = Path(cfg.paths.outputs)
-    nodes = _convert_to_dict(cfg.loggers)
-    return Loggers(
-        tuple(find_component("loggers", name).build(nodes[name], outputs=outputs) for name in nodes), outputs
-    )
+    nodes = _convert_to_dict(cfg.loggers).items()
+    loggers = (find_component("loggers", name).build(node, outputs=outputs) for name, node in nodes)
+    return Loggers(tuple(loggers))
 
 
 def build(cfg: DictConfig, slot: str) -> Any:
-    """Build the component in a slot of a checked config. Raises InputError if its class does not accept the
-    keys."""
+    """Build the component in a slot of a checked config. Raises InputError if its class rejects the keys."""
     component, keys = _read_component(cfg, slot)
     try:
         return component.build(keys)
@@ -304,9 +300,8 @@ SET_BY_MODELS = ("ema",)
 
 
 def make_readable_name(kind: str, config: Mapping[str, Any]) -> str:
-    """Return a readable name for a run of this kind (see `Identity`) and resolved config: the options of
-    slots, and values of other keys, that differ from the defaults. Data, paths, loggers and keys without an
-    effect on the results are omitted."""
+    """Return a readable name for a run of this kind (see `Identity`) and resolved config: the options, and
+    values of other keys, that differ from the defaults and affect results. Data is omitted."""
     words = [] if kind == NETWORK else [describe_kind(kind)]
     words += ["published weights"] if config.get("imported_weights") else []
     try:
@@ -344,11 +339,8 @@ def _list_differences(config: Mapping[str, Any]) -> Iterator[str]:
     counting = select_training_config(config) | select_training_config(default)  # a key may count in one only
     for key in counting:
         group, _, last = key.partition(".")
-        if (
-            group in (*custom, "profile")
-            or last == "name"
-            or key in ("seed", "vqvae.seed", "imported_weights")
-        ):
+        unnamed = group in (*custom, "profile") or last == "name"
+        if unnamed or key in ("seed", "vqvae.seed", "imported_weights"):
             continue
         if key in own and own[key] != usual.get(key):
             yield f"{key}={format_value(own[key])}"
@@ -361,13 +353,10 @@ def list_overrides(config: Mapping[str, Any]) -> list[str]:
     plugins = [f"plugins={format_value(config['plugins'])}"] if config.get("plugins") else []
     if missing := [key for key in ("data", "model", "profile") if key not in config]:
         raise InputError(f"{missing[0]}: is not in the run's config; this version cannot compose it")
-    data = [f"data={config['data']['name']}"]  # recorded data has no default folder
-    data += (
-        [_make_repeated("data.root", own["data.root"])]
-        if "data.root" in own and data != ["data=synth"]
-        else []
-    )
-    words = [*plugins, *data, f"profile={config['profile']['sizes']}"]
+    words = [*plugins, f"data={config['data']['name']}"]
+    if "data.root" in own and config["data"]["name"] != "synth":  # recorded data has no default folder
+        words.append(_make_repeated("data.root", own["data.root"]))
+    words.append(f"profile={config['profile']['sizes']}")
     options = {slot: find_option(config, slot) for slot in SLOTS if slot in config}
     for slots in (["model"], [slot for slot in options if slot != "model"]):  # a model sets other slots
         default = _compose_plain(words)
@@ -400,8 +389,7 @@ def _is_shipped(slot: str, option: str) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def _compose_default(overrides: tuple[str, ...]) -> dict[str, Any]:
-    """Return the config of `memmlp train` with these overrides, without groups that names omit. Hydra's
-    global state is restored afterwards."""
+    """Return the config of `memmlp train` with these overrides, without groups that names omit."""
     hydra = GlobalHydra.instance()
     before, hydra.hydra = hydra.hydra, None
     try:

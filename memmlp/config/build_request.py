@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import getitem
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -30,9 +30,8 @@ SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit, "pe
 
 def build_motion(config: Mapping[str, Any]) -> MotionSource:
     """Build the source of an experiment's motion from a resolved config. The name of a synthetic folder
-    contains the generator's settings and its component version above 1, so different ones use different
-    folders. Raises InputError if a list of groups cannot be read, two folders have the same name, or the
-    generator does not exist."""
+    contains the generator's settings and its component version above 1. Raises InputError if a list of groups
+    cannot be read, two folders have the same name, or the generator does not exist."""
     data = config["data"]
     root, split = _build_clip_request(data)
     generate: Callable[[Path], object] | None = None
@@ -45,7 +44,7 @@ def build_motion(config: Mapping[str, Any]) -> MotionSource:
             folder = f"{settings['minutes']:g}min-seed{settings['seed']}"
         version = f"-v{generator.version}" if generator.version > 1 else ""
         root = Path(data["root"]) / f"{folder}{version}"
-        generate = partial(_run_generator, generator, settings)
+        generate = partial(_call_generator, generator, settings)
 
     interpolation = data.get("interpolation", LINES)  # old configs without the key used lines
     clips = ClipFolder(root, split, str(data["body"]), data["min_frames"], data["strict"], interpolation)
@@ -53,7 +52,7 @@ def build_motion(config: Mapping[str, Any]) -> MotionSource:
     return MotionSource(clips, generate, caches, partial=data.get("partial", False))
 
 
-def _run_generator(generator: Component, settings: Mapping[str, Any], folder: Path) -> None:
+def _call_generator(generator: Component, settings: Mapping[str, Any], folder: Path) -> None:
     generator.kind(folder, **settings)
 
 
@@ -79,13 +78,7 @@ def read_source_weights(data: DictConfig) -> Mapping[str, float] | None:
     return weights if any(weights.values()) else None
 
 
-class _ClipRequest(NamedTuple):
-    root: Root
-    split: Split
-
-
-def _build_clip_request(data: Mapping[str, Any]) -> _ClipRequest:
-    """Return the folders and the split of the config. Each source has a separate split."""
+def _build_clip_request(data: Mapping[str, Any]) -> tuple[Root, Split]:
     keys = copy.deepcopy(data["split"])
     if "kinds" in keys:
         keys["kinds"] = {name: Kind(**kind) for name, kind in keys["kinds"].items()}
@@ -93,12 +86,12 @@ def _build_clip_request(data: Mapping[str, Any]) -> _ClipRequest:
     if sources := data.get("sources"):
         folders = NamedFolders({name: Path(source["root"]) for name, source in sources.items()})
         splits = {name: _build_source_split(split, name, source) for name, source in sources.items()}
-        return _ClipRequest(folders, MixedSplit(splits))
+        return folders, MixedSplit(splits)
     roots = data["root"] if isinstance(data["root"], list) else [data["root"]]
     if len(roots) == 1:
-        return _ClipRequest(Path(roots[0]), split)
+        return Path(roots[0]), split
     folders = NamedFolders.from_paths([Path(root) for root in roots])
-    return _ClipRequest(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
+    return folders, MixedSplit(dict.fromkeys(folders.sources, split))
 
 
 def _build_source_split(split: SeededSplit, name: str, source: Mapping[str, Any]) -> SeededSplit:
@@ -111,8 +104,8 @@ def _build_source_split(split: SeededSplit, name: str, source: Mapping[str, Any]
 
 
 def build_request(cfg: DictConfig) -> RunRequest:
-    """Build the run request of a checked config. Raises InputError if a package of the config is not in use,
-    or the motion source cannot be built."""
+    """Build the run request of a checked config. Raises InputError if a package of the config is not in
+    use."""
     config = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
     config["plugins"] = plugins.find_used_packages(config)
     return RunRequest(config, build_motion(config))

@@ -1,7 +1,6 @@
 """Checks of a composed config before a run starts. Each error is one line that names the key."""
 
 import dataclasses
-import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from types import NoneType, UnionType
@@ -19,7 +18,7 @@ from omegaconf.errors import (
 )
 
 from memmlp.common.components import SLOTS, find_chosen_settings
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, suggest
 from memmlp.common.overrides import flatten
 from memmlp.common.settings import Rule
 from memmlp.common.text_formats import join_command, make_override
@@ -34,8 +33,8 @@ class CheckedConfig(NamedTuple):
 
 
 def check(cfg: DictConfig) -> CheckedConfig:
-    """Check a composed config. Raises InputError for a missing or unknown key, an invalid value, or values
-    that cannot be combined."""
+    """Check a composed config. Raises InputError for a bad key, a bad value, or values that cannot be
+    combined."""
     if OmegaConf.get_type(cfg) is not Config:
         raise InputError("config: must start from /schema/config, as conf/train.yaml does")
     config = _resolve(cfg)
@@ -73,8 +72,7 @@ def _make_missing_error(name: str) -> InputError:
 def _list_values(
     node: DictConfig, values: Mapping[str, Any], prefix: str
 ) -> Iterator[tuple[str, Any, Rule | None]]:
-    """Yield the dotted name, value and rule of each key in a typed node, given with its resolved values, and
-    in its groups. Raises InputError for a key that is not in the schema."""
+    """Yield dotted name, value and rule of each key in a typed node. Raises InputError for an unknown key."""
     schema: Any = OmegaConf.get_type(node)
     if dataclasses.is_dataclass(schema):
         rules = {spec.name: spec.metadata.get("rule") for spec in dataclasses.fields(schema)}
@@ -91,15 +89,12 @@ def _list_values(
 
 def describe_unknown_key(name: str, keys: Sequence[str]) -> str:
     """Return the error line for an unknown dotted key of a group with these keys."""
-    own = re.split(r"[./@]", name)[-1]
-    near = difflib.get_close_matches(own, keys, n=1)
-    hint = f"did you mean {near[0]}? " if near else ""
+    hint = suggest(re.split(r"[./@]", name)[-1], keys)
     expected = f"expected one of {', '.join(keys)}" if keys else "expected no keys"
     return f"{name}: no such key; {hint}{expected}"
 
 
 def _find_problems(config: Mapping[str, Any]) -> Iterator[str]:
-    """Yield an error line for values that cannot be combined. Components check their own keys."""
     for name, logger in config["loggers"].items():
         if logger["name"] != name:
             yield f"loggers.{name}.name={logger['name']}: must be {name}, the name of its key"
@@ -140,7 +135,6 @@ WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text
 
 
 def _quote_texts(key: str, value: str) -> str:
-    """Return the override with quotes around its value, or around each item of a list."""
     if not (value.startswith("[") and value.endswith("]")):
         return make_override(key, value)
     return f"{key}=[{','.join(make_override('', item.strip())[1:] for item in value[1:-1].split(','))}]"
@@ -164,7 +158,9 @@ def explain_error(error: Exception, overrides: Sequence[str]) -> str:
     if isinstance(error, OmegaConfBaseException):
         return _explain_type_error(error, None)
     if isinstance(error, ConfigCompositionException):
-        return _explain_composition(str(error))
+        if ambiguous := re.match(r"Ambiguous value for argument '(.*)'", str(error)):
+            return f"{ambiguous[1]}: expected one value, a list [a,b], or several values with -m"
+        return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
     null = next((override for override in overrides if re.fullmatch(r"[\w/]+=null", override)), None)
     if null and "NoneType" in str(error):
         return f"{null}: must be one of its options; ~{null.removesuffix('=null')} removes the group"
@@ -176,13 +172,11 @@ def _explain_missing_option(error: MissingConfigException) -> str:
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
     if not error.options:
         return _get_first_line(error)
-    near = difflib.get_close_matches(option, error.options, n=1)
-    hint = f"did you mean {near[0]}? " if near else ""
-    return f"{group}={option}: no such option; {hint}must be one of {', '.join(error.options)}"
+    hint, options = suggest(option, error.options), ", ".join(error.options)
+    return f"{group}={option}: no such option; {hint}must be one of {options}"
 
 
 def _explain_type_error(error: OmegaConfBaseException, override: str | None) -> str:
-    """Explain why the schema rejected an override: unknown key, wrong type, or removal of a key."""
     name = str(error.full_key or override)
     schema = error.object_type
     if not dataclasses.is_dataclass(schema) and ("SourceConfig" in str(error) or name.startswith(SOURCES)):
@@ -200,7 +194,6 @@ def _explain_type_error(error: OmegaConfBaseException, override: str | None) -> 
 
 
 def _describe_expected(name: str, schema: Any, error: OmegaConfBaseException) -> str:
-    """Describe the type and the limits of a key in the schema."""
     if not dataclasses.is_dataclass(schema):
         return f"{_describe_type(error.ref_type)} ({_get_first_line(error)})"
     own = name.split(".")[-1]
@@ -218,13 +211,6 @@ def _describe_type(hint: Any) -> str:
     if dataclasses.is_dataclass(hint):
         return "a group of " + ", ".join(field.name for field in dataclasses.fields(hint))
     return WORDS.get(hint, str(getattr(hint, "__name__", hint)))
-
-
-def _explain_composition(text: str) -> str:
-    ambiguous = re.match(r"Ambiguous value for argument '(.*)'", text)
-    if ambiguous:
-        return f"{ambiguous[1]}: expected one value, a list [a,b], or several values with -m"
-    return "; ".join(line.strip() for line in text.splitlines() if line.strip())
 
 
 def _get_first_line(error: Exception) -> str:

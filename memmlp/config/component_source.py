@@ -36,7 +36,6 @@ class ComponentSource(ConfigSource):
 
     @staticmethod
     def scheme() -> str:
-        """Return the URL scheme of this source in Hydra's search path."""
         return SCHEME
 
     def load_config(self, config_path: str) -> ConfigResult:
@@ -46,15 +45,12 @@ class ComponentSource(ConfigSource):
         return ConfigResult(self.provider, f"{SCHEME}://", node, {"package": package})
 
     def available(self) -> bool:
-        """Return True, because components are always available."""
         return True
 
     def is_group(self, config_path: str) -> bool:
-        """Return whether a path is a group of options."""
         return config_path.strip("/") == SCHEMA or is_group(config_path.strip("/"))
 
     def is_config(self, config_path: str) -> bool:
-        """Return whether a path is an option of a group."""
         group, _, name = config_path.removesuffix(".yaml").partition("/")
         return name in self.list(group, ObjectType.CONFIG)
 

@@ -23,21 +23,19 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from memmlp.common.components import SLOTS, collect_attribute, collect_components, list_component_names
+from memmlp.common.components import list_component_names
 from memmlp.common.errors import InputError
 from memmlp.common.files import find_packaged_folder
-from memmlp.common.overrides import Override, flatten, parse_overrides, select_last_by_key
+from memmlp.common.overrides import Override, flatten, parse_overrides
 from memmlp.common.schema import parse_config_yaml
-from memmlp.common.settings import Settings
 from memmlp.common.text_formats import join_command, keep_text, make_override
 from memmlp.config import plugins
 from memmlp.config.check import CheckedConfig, check, describe_unknown_key, explain_error
 from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register_components
-from memmlp.config.schema import Config, make_typed
+from memmlp.config.schema import Config
 
 VERSION_BASE = "1.3"
 CONFIG = "train"
-SEARCHPATH = "hydra.searchpath"
 EXPERIMENT = "experiment"
 """The config group with options that override other groups and keys."""
 
@@ -46,12 +44,8 @@ SWITCHES = {
     "--shell-completion": "-sc",
 }  # fmt: skip
 VALUES = {
-    "--cfg": "-c",
-    "--package": "-p",
-    "--config-path": "-cp",
-    "--config-name": "-cn",
-    "--config-dir": "-cd",
-}
+    "--cfg": "-c", "--package": "-p", "--config-path": "-cp", "--config-name": "-cn", "--config-dir": "-cd",
+}  # fmt: skip
 """Hydra's flags with their short forms. SWITCHES have no value; VALUES have one."""
 
 
@@ -95,7 +89,6 @@ class UserConfigs(SearchPathPlugin):
     """Adds users' config folders and the components to Hydra's search path, after memmlp's folder."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Append the folders and the components. Hydra calls this whenever it composes."""
         for provider, folder in plugins.list_config_folders():
             search_path.append(provider, f"file://{folder}")
         search_path.append(SCHEME, f"{SCHEME}://")
@@ -119,22 +112,17 @@ def compose_unchecked(overrides: Sequence[str]) -> DictConfig:
         return _compose_job(args, list(overrides))
 
 
-def compose_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
-    """Compose another config than `train`, also from a `folder` of custom configs, which is searched first,
-    and return it as plain dictionaries. It is not checked."""
-    args = parse_hydra_arguments([*(["--config-dir", str(folder)] if folder else []), *overrides])
+def compose_plain(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Compose another config than `train`, and return it as plain dictionaries. It is not checked."""
+    args = parse_hydra_arguments(overrides)
     with _initialize_hydra(args), _convert_errors(overrides):
         return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
 
 
-def find_experiment_keys(options: Sequence[str], overrides: Sequence[str] = ()) -> set[str]:
+def find_experiment_keys(options: Sequence[str]) -> set[str]:
     """Return the groups and dotted keys that options of the group `experiment`, and those in their defaults
-    lists, set. Unknown options are ignored. Of `overrides`, only `hydra.searchpath` has an effect."""
-    folders = [
-        find_packaged_folder("conf"),
-        *(folder for _, folder in plugins.list_config_folders()),
-        *_list_search_path(overrides),
-    ]
+    lists, set. Unknown options are ignored."""
+    folders = [find_packaged_folder("conf"), *(folder for _, folder in plugins.list_config_folders())]
     keys, pending, seen = set[str](), list(options), set[str]()
     while pending:
         name = pending.pop().removeprefix(f"/{EXPERIMENT}/")
@@ -189,9 +177,8 @@ def _check_first_key_parts(args: argparse.Namespace) -> None:
 
 
 def _compose_job(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
-    """Compose a job's config; the result is identical to Hydra's. Group options are composed only once for
-    all jobs, because this takes 90 % of the time, and a sweep's configs often differ only in values. With
-    custom config folders, Hydra composes each config, because the files may change."""
+    """Compose a job's config; the result is identical to Hydra's. Group options are composed once for all
+    jobs, since this takes 90 % of the time. With custom folders, Hydra composes each config."""
     parsed = OverridesParser.create().parse_overrides(overrides)
     options = [
         override
@@ -217,69 +204,10 @@ def _compose_job(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
 
 @functools.lru_cache(maxsize=128)
 def _compose_options(*options: str) -> bytes:
-    """Return the config of `memmlp train` with these group options, pickled for fast copies."""
-    cfg = None
-    if any(override.key in SLOTS for override in parse_overrides(options)):
-        with suppress(OmegaConfBaseException):  # Hydra reports the error
-            cfg = _compose_components(options)
-    return pickle.dumps(compose(CONFIG, list(options)) if cfg is None else cfg)
-
-
-def _compose_components(options: Sequence[str]) -> DictConfig | None:
-    """Insert components into a config that Hydra composed with the other options and without a model, which
-    takes a tenth of the time. A component sets its own slot. A model may also set options of other slots, and
-    keys. The result is None if only Hydra can combine the options."""
-    chosen = select_last_by_key(options)
-    special = any(override.signs or len(override.options) != 1 for override in chosen.values())
-    if special or EXPERIMENT in chosen:
-        return None
-    names = {"model": _find_default_model()}
-    names |= {key: override.options[0] for key, override in chosen.items() if key in SLOTS}
-    model = collect_components().get(("model", str(names["model"])))
-    if model is None or not (defaults := collect_attribute(model.settings, "defaults")).keys() <= {*SLOTS}:
-        return None
-    others = [override.text for key, override in chosen.items() if key not in SLOTS]
-    cfg: DictConfig = pickle.loads(_compose_options(*others, "~model"))
-    for slot, name in {**defaults, **names}.items():
-        if name is None:
-            cfg[slot] = None
-        elif (slot != "model" and _has_defaults(slot, name)) or (node := _make_node(slot, name)) is None:
-            return None
-        else:
-            cfg[slot] = node
-    for key, value in collect_attribute(model.settings, "recipe").items():
-        OmegaConf.update(cfg, key, value)
-    return cfg
-
-
-@functools.cache
-def _find_default_model() -> str:
-    content = yaml.safe_load((find_packaged_folder("conf") / f"{CONFIG}.yaml").read_text(encoding="utf-8"))
-    (name,) = (entry["model"] for entry in content["defaults"] if "model" in entry)
-    return str(name)
-
-
-def _has_defaults(slot: str, name: str) -> bool:
-    kind = found.settings if (found := collect_components().get((slot, name))) else Settings
-    return any(collect_attribute(kind, attribute) for attribute in ("defaults", "recipe"))
-
-
-def _make_node(slot: str, name: str) -> DictConfig | None:
-    """Return the typed keys of a component or YAML file; None if only Hydra can compose them."""
-    path = find_packaged_folder("conf") / slot / f"{name}.yaml"
-    if not path.is_file():
-        component = collect_components().get((slot, name))
-        return make_typed(component.settings) if component else None
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    match content.pop("defaults", None):
-        case [str(other), "_self_"] if (base := _make_node(slot, other)) is not None:
-            return cast(DictConfig, OmegaConf.merge(base, content))
-    return None
+    return pickle.dumps(compose(CONFIG, list(options)))
 
 
 def _reject_overrides_without_effect(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Raise InputError for overrides without an effect: a plugin in a config file, and a split fraction if
-    each source sets its own."""
     for name in config["plugins"]:
         if name not in plugins.list_active():
             raise InputError(
@@ -298,8 +226,7 @@ def _reject_overrides_without_effect(config: Mapping[str, Any], overrides: Seque
 
 
 def _check_texts(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Raise InputError for a text that Hydra would change, because it reads the text as a number or bool. For
-    example, a folder 2024_11 would become 202411, and 1e3 would become 1000.0."""
+    """Raise InputError for a text that Hydra would change: 2024_11 into 202411, or 1e3 into 1000.0."""
     values = flatten(config)
     for parsed in OverridesParser.create().parse_overrides(list(overrides)):
         value, kept = parsed.value(), values.get(parsed.key_or_group)
@@ -364,27 +291,21 @@ def _initialize_hydra(args: argparse.Namespace) -> Iterator[None]:
 
 
 def _check_hidden(args: argparse.Namespace) -> None:
-    """Raise InputError for a custom config file that Hydra ignores, because a component, or a file in an
-    earlier folder, has its name."""
-    main = _find_folder(args.config_path or find_packaged_folder("conf"), "--config-path")
-    before = [
-        main,
-        *(folder for provider, folder in plugins.list_config_folders() if provider != plugins.OWN),
-    ]
-    own_folders = [_find_folder(args.config_dir, "--config-dir")] if args.config_dir else []
-    own_folders += [folder for provider, folder in plugins.list_config_folders() if provider == plugins.OWN]
-    for folder in [*own_folders, *_list_search_path(args.overrides)]:
+    """Raise InputError for a custom config file that a component, or a file in an earlier folder, hides."""
+    folders = plugins.list_config_folders()
+    own = [folder for provider, folder in folders if provider == plugins.OWN]
+    own += [_find_folder(args.config_dir, "--config-dir")] if args.config_dir else []
+    others = [_find_folder(args.config_path or find_packaged_folder("conf"), "--config-path")]
+    others += [folder for provider, folder in folders if provider != plugins.OWN]
+    for folder in own:
         for path in sorted(folder.rglob("*.yaml")):
-            if plugins.is_component(path.relative_to(folder)):
+            option = path.relative_to(folder)
+            if plugins.is_component(option):
                 raise InputError(f"{path}: memmlp already has an option with this name; rename the file")
-        for other in before:
-            for path in sorted(other.rglob("*.yaml")):
-                hidden = folder / path.relative_to(other)
-                if hidden.is_file() and hidden.read_bytes() != path.read_bytes():
-                    raise InputError(f"{hidden}: Hydra would use {path} instead; rename the file")
-        before.append(folder)
-        for path in sorted(folder.rglob("*.yaml")):
-            group = path.relative_to(folder).parent.as_posix()
+            for used in (other / option for other in others):
+                if used.is_file() and used.read_bytes() != path.read_bytes():
+                    raise InputError(f"{path}: Hydra would use {used} instead; rename the file")
+            group = option.parent.as_posix()
             if path.stem == args.config_name if group == "." else _is_any_group(group):
                 _check_scalars(path)
 
@@ -394,8 +315,7 @@ def _is_any_group(name: str) -> bool:
 
 
 def _check_scalars(path: Path) -> None:
-    """Raise InputError for a text that the command line keeps, but that YAML 1.1 reads as another value, such
-    as 010 and 10_01, which Hydra would convert to the texts 8 and 1001 where a key must be text."""
+    """Raise InputError for a text that YAML 1.1 reads as another value, such as 010 (8) and 10_01 (1001)."""
     with suppress(yaml.YAMLError, UnicodeDecodeError):  # Hydra's error names the file
         for token in yaml.scan(path.read_text(encoding="utf-8")):
             if not isinstance(token, yaml.ScalarToken) or not token.plain:
@@ -410,12 +330,6 @@ def _check_scalars(path: Path) -> None:
                 )
 
 
-def _list_search_path(overrides: Sequence[str]) -> list[Path]:
-    places = [one for word in parse_overrides(overrides) if word.key == SEARCHPATH for one in word.options]
-    local = [place for place in places if "://" not in place or place.startswith("file://")]
-    return [Path(place.removeprefix("file://")).absolute() for place in local]
-
-
 def _find_folder(name: str | Path, option: str) -> Path:
     if not Path(name).is_dir():
         raise InputError(f"{option} {name}: must be an existing folder")
@@ -423,9 +337,8 @@ def _find_folder(name: str | Path, option: str) -> Path:
 
 
 def _list_jobs(args: argparse.Namespace) -> list[list[str]]:
-    """Return the overrides of each job; there is one job without a multirun. Raises InputError for an
-    override that cannot be parsed, or would replace another one: a second `experiment=`, or in a multirun a
-    second override of a group's keys."""
+    """Return the overrides of each job. Raises InputError for an override that cannot be parsed, or would
+    replace another one: a second `experiment=`, or in a multirun a second override of a group's keys."""
     with _convert_errors(args.overrides):
         parsed = OverridesParser.create().parse_overrides(args.overrides)
         chosen = list(dict.fromkeys(str(one.input_line) for one in parsed if one.key_or_group == EXPERIMENT))
@@ -448,7 +361,6 @@ def _list_jobs(args: argparse.Namespace) -> list[list[str]]:
 
 @contextmanager
 def _convert_errors(overrides: Sequence[str]) -> Iterator[None]:
-    """Convert errors of the context into an InputError of one line."""
     try:
         yield
     except InputError:

@@ -19,9 +19,8 @@ if TYPE_CHECKING:
 
 
 def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
-    """Load a sweep (a file's path, a shipped sweep's name, or a table's number), and activate the plugins
-    that its base or the overrides (see `Sweep.with_overrides`) name. Raises InputError if it does not exist,
-    or is invalid."""
+    """Load a sweep (a file's path, a shipped sweep's name, or a table's number) with overrides, and activate
+    its plugins. Raises InputError if it does not exist, or is invalid."""
     activate(find_named_packages(overrides))
     sweep = load_sweep(
         _find_sweep_file(name), lambda base: activate(find_named_packages(base))
@@ -33,9 +32,8 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
 
 def check_preset(sweep: Sweep, variant: Variant) -> None:
     """Check that other overrides do not conflict with a variant's `experiment=NAME`. In Hydra, an override of
-    a group or key has priority over an experiment, and the last experiment replaces earlier ones. So an
-    override of the base could silently undo a part of the variant. Raises InputError for a conflict; the
-    message names the sweep, the variant and both overrides."""
+    a key has priority over an experiment, and the last experiment replaces earlier ones. So an override of
+    the base could silently undo a part of the variant. Raises InputError for a conflict."""
     from memmlp.config.compose import EXPERIMENT, find_experiment_keys
 
     variant_words = {parse_key(word): word for word in variant.overrides or ()}
@@ -50,7 +48,7 @@ def check_preset(sweep: Sweep, variant: Variant) -> None:
     if options and (lost := [option for option in before if option not in options]):
         both = ",".join(dict.fromkeys([*before, *options]))
         raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; use {EXPERIMENT}=[{both}]")
-    preset_keys = find_experiment_keys(options, sweep.merge_overrides(variant))
+    preset_keys = find_experiment_keys(options)
     for key, word in (around | {parse_key(word): word for word in others}).items():
         if key in preset_keys:
             raise InputError(f"{where} sets {key}, and {word} would override it; remove it or the experiment")
@@ -79,8 +77,7 @@ def is_path(name: str) -> bool:
 
 
 def get_sweep_folder(sweep: Sweep, outputs: Path) -> Path:
-    """Return the folder of a sweep's plan, seed rounds and logs. It depends on the overrides of the command
-    line, but not on their order."""
+    """Return the folder of a sweep's plan, seed rounds and logs. The overrides' order does not matter."""
     if not sweep.command_line:
         return outputs / "sweeps" / sweep.name
     ordered = sorted(sweep.command_line, key=parse_key)
@@ -88,10 +85,9 @@ def get_sweep_folder(sweep: Sweep, outputs: Path) -> Path:
 
 
 def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-    """Make the plan of a sweep with the command line's overrides. With `prepare`, also write it into the
-    sweep's folder, and prepare missing data. Otherwise, entries with unprepared data are omitted, because a
-    run's id depends on its data. Raises InputError for an invalid config; the message names the variant and
-    the key."""
+    """Make the plan of a sweep. With `prepare`, also write it into the sweep's folder, and prepare missing
+    data. Otherwise, entries with unprepared data are omitted, because a run's id depends on its data. Raises
+    InputError for an invalid config."""
     planned: list[tuple[Entry, list[RunTask]]] = []
     data: dict[str, str | None] = {}
     for variant in sweep.list_runnable():
@@ -124,8 +120,8 @@ def _build_requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[t
 
 
 def make_tasks(request: RunRequest, data: str) -> list[RunTask]:
-    """Return the tasks of a request for prepared data with this digest: its prerequisite runs in order, then
-    its own run."""
+    """Return the tasks of a request for data with this digest: its prerequisite runs in order, then its own
+    run."""
     from memmlp.training.request import remove_refiner
 
     bare = remove_refiner(request.config) if request.config["refiner"] is not None else request.config
@@ -138,8 +134,7 @@ def make_tasks(request: RunRequest, data: str) -> list[RunTask]:
 
 
 def _find_data_digest(request: RunRequest, prepare: bool, digests: dict[str, str | None]) -> str | None:
-    """Return the digest of a request's prepared data, or None. Digests are cached in `known` by
-    data config."""
+    """Return the digest of a request's prepared data, or None; `digests` caches it by data config."""
     key = digest([request.config["data"], request.config["paths"]])
     if key not in digests:
         digests[key] = request.motion.prepare().digest if prepare else request.motion.find_digest()

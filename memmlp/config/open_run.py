@@ -129,9 +129,10 @@ def import_weights(
         InputError: if the checkpoint cannot be read, or does not fit the network and the overrides.
     """
     network = find_component("model", name)
-    if (release := getattr(network.settings, "release", None)) is None:
-        known = [one for one in list_component_names("model") if _get_release(one)]
-        raise InputError(f"{name}: has no published weights; must be {' or '.join(known)}")
+    models = {one: find_component("model", one).settings for one in list_component_names("model")}
+    releases = {one: release for one, kind in models.items() if (release := getattr(kind, "release", None))}
+    if (release := releases.get(name)) is None:
+        raise InputError(f"{name}: has no published weights; must be {' or '.join(releases)}")
     kind: type[MotionModel] = network.kind
     files = [path, *([refiner] if refiner else [])]
     vectors = checkpoint.read_published_statistics(statistics, ROTATION.stop) if statistics else None
@@ -165,7 +166,6 @@ def import_weights(
 
 
 def _read_published(path: Path, release: Release) -> tuple[dict[str, Tensor], dict[str, int]]:
-    """Return a checkpoint's tensors, and the config values that their shapes determine."""
     tensors = checkpoint.read_published(path)
     with _naming_checkpoint(path):
         return tensors, checkpoint.find_published_sizes(tensors, release)
@@ -178,13 +178,8 @@ def _rename_published(
         return checkpoint.rename_published(tensors, release, dict(module.named_parameters()))
 
 
-def _get_release(name: str) -> Release | None:
-    return getattr(find_component("model", name).settings, "release", None)
-
-
 @contextmanager
 def _naming_checkpoint(path: Path) -> Iterator[None]:
-    """Put the file's name before errors of the context."""
     try:
         yield
     except ValueError as error:
@@ -197,8 +192,7 @@ def find_clip(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:
 
 
 def find_clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
-    """Return the index of a test clip. Raises InputError for an unknown name; the message begins with the
-    option or argument `key`, and lists the names."""
+    """Return the index of a test clip. Raises InputError, which begins with `key`, for an unknown name."""
     if name not in test.names:
         raise InputError(f"{key} {name}: must be one of the run's test clips ({', '.join(test.names)})")
     return test.names.index(name)

@@ -18,8 +18,9 @@ import pkgutil
 import re
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -54,12 +55,6 @@ def activate(names: Iterable[str] = ()) -> None:
 @functools.cache
 def list_installed() -> tuple[str, ...]:
     """Return the packages that installed distributions declare as entry points."""
-    files = (file for folder in sys.path for file in Path(folder).glob("*-info/entry_points.txt"))
-    readable = (file for file in files if os.access(file, os.R_OK))
-    if not any(f"[{GROUP}]".encode() in file.read_bytes() for file in readable):
-        return ()
-    from importlib import metadata  # takes 3 % of a short command's time
-
     return tuple(dict.fromkeys(entry.module for entry in metadata.entry_points(group=GROUP)))
 
 
@@ -73,11 +68,9 @@ def find_named_packages(words: Iterable[str]) -> list[str]:
     values = [one.value or "" for one in parse_overrides(words) if one.key == KEY]
     packages: list[str] = []
     for value in values:
-        try:
+        with suppress(yaml.YAMLError):  # reported when the config is composed
             content = parse_config_yaml(value)
-        except yaml.YAMLError:  # reported when the config is composed
-            continue
-        packages += [str(name) for name in content] if isinstance(content, list) else []
+            packages += map(str, content) if isinstance(content, list) else []
     return packages
 
 
@@ -182,9 +175,8 @@ def find_used_packages(config: Mapping[str, Any]) -> list[str]:
 
 
 def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where: str) -> None:
-    """Check that the packages of a config are in use, given their recorded facts. `where` is the owner of the
-    config, such as "run ID", for the message. Raises InputError for a package that is missing or not in use.
-    """
+    """Check that the packages of a config are in use, given their recorded facts. `where` names the config's
+    owner, such as "run ID". Raises InputError for a package that is missing or not in use."""
     for name in config.get(KEY) or ():
         if name not in _active:
             version = (recorded.get(name) or {}).get("version")
@@ -210,8 +202,8 @@ DEFAULT_GROUPING = "cmu"  # the grouping of data=mocap
 
 
 def choose_grouping(names: Collection[str]) -> str | None:
-    """Return the shipped grouping that these clips (paths without `.npz`) need in place of DEFAULT_GROUPING;
-    None if the default fits, or if no grouping fits."""
+    """Return the shipped grouping that fits these clips (paths without `.npz`) if DEFAULT_GROUPING does not;
+    or None."""
     fitting = {
         path.stem
         for path in (find_packaged_folder("conf") / "data" / "grouping").glob("*.yaml")

@@ -322,14 +322,8 @@ ONLY = {
 
 
 def make_typed(schema: Any) -> Any:
-    """Return the typed config of a schema. From the second call, it is a copy, which is quicker."""
-    if schema not in _made:
-        _made.add(schema)
-        return OmegaConf.structured(schema)
+    """Return the typed config of a schema. Unpickling is quicker than OmegaConf's way from a dataclass."""
     return pickle.loads(_pickle_typed(schema))
-
-
-_made = set[Any]()
 
 
 @functools.lru_cache(maxsize=256)
@@ -338,32 +332,26 @@ def _pickle_typed(schema: Any) -> bytes:
 
 
 def restore_config(config: Mapping[str, Any]) -> DictConfig:
-    """Convert a run's recorded config to a typed config. Raises InputError for a component that no package in
-    use declares, and OmegaConfBaseException, KeyError, TypeError or ValueError if it does not match this
-    version's schema."""
+    """Convert a run's recorded config to a typed config. Raises InputError for an unknown component, and
+    OmegaConfBaseException, KeyError, TypeError or ValueError if it does not match this version's schema."""
     cfg = make_typed(Config)
     for key, content in escape_interpolations(config).items():
         if not isinstance(content, Mapping):
             cfg[key] = content
         elif key == "loggers":
-            cfg.loggers = {
-                name: _merge_typed(find_component(key, name).settings, node) for name, node in content.items()
-            }
+            cfg.loggers = {name: _restore_component(key, name, node) for name, node in content.items()}
         elif key == "data":
             synth = content.get("synth")
-            cfg.data = _merge_typed(_choose_data_schema(content), {**content, "synth": None})
+            schema = SCHEMAS["data_synth" if synth else f"data_{content['split']['name']}"]
+            cfg.data = OmegaConf.merge(make_typed(schema), {**content, "synth": None})
             if synth:
-                cfg.data.synth = _merge_typed(find_component("generator", synth["name"]).settings, synth)
+                cfg.data.synth = _restore_component("generator", synth["name"], synth)
         elif key in SLOTS:
-            cfg[key] = _merge_typed(find_component(key, content["name"]).settings, content)
+            cfg[key] = _restore_component(key, content["name"], content)
         else:
             cfg[key] = OmegaConf.merge(cfg[key], content)
     return cfg
 
 
-def _merge_typed(kind: Any, content: Mapping[str, Any]) -> Any:
-    return OmegaConf.merge(make_typed(kind), content)
-
-
-def _choose_data_schema(content: Mapping[str, Any]) -> type:
-    return SCHEMAS["data_synth" if content.get("synth") else f"data_{content['split']['name']}"]
+def _restore_component(slot: str, name: str, content: Mapping[str, Any]) -> Any:
+    return OmegaConf.merge(make_typed(find_component(slot, name).settings), content)

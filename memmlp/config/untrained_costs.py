@@ -19,10 +19,13 @@ def measure_untrained_variants(
     sweep: Sweep, runs: Mapping[str, RunsBySeed]
 ) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
     """Measure an untrained network for each variant of a sweep without a finished run; times only if the
-    sweep's metrics include one. Return the runs by variant and seed, with the untrained networks added, and
-    flags that name these variants. Raises InputError if the sweep's metrics include errors (see
-    `check_costs`)."""
-    check_costs(sweep)
+    sweep shows one. Return all runs by variant and seed, and flags that name these variants. Raises
+    InputError if the sweep's metrics include errors."""
+    if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
+        raise InputError(
+            f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}; "
+            f"expected only metrics from {', '.join(COSTS)}"
+        )
     timed = not set(sweep.metrics) <= set(SIZES)
     without = [variant for variant in sweep.list_runnable() if not runs[variant.label]]
     costs: dict[str, RunsBySeed] = {}
@@ -38,18 +41,8 @@ def measure_untrained_variants(
     return {label: dict(costs.get(label, found)) for label, found in runs.items()}, flags
 
 
-def check_costs(sweep: Sweep) -> None:
-    """Raise InputError if a sweep's metrics include errors, which need trained networks."""
-    if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
-        raise InputError(
-            f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}; "
-            f"expected only metrics from {', '.join(COSTS)}"
-        )
-
-
 def measure_costs(overrides: tuple[str, ...], timed: bool) -> MeasuredRun:
-    """Measure a network with random weights, and the ONNX file of its live step; its times only if
-    `timed`."""
+    """Measure a network with random weights, and the ONNX file of its live step; times only if `timed`."""
     from memmlp.deploy.export import export  # slow to import
     from memmlp.deploy.latency import measure_size
     from memmlp.live.pose_latency import measure_pose_times

@@ -4,7 +4,6 @@ Archives are not trusted: only names of run files are accepted, nothing is execu
 is moved to the outputs folder only if it is complete and matches the digests in its files."""
 
 import errno
-import mmap
 import os
 import re
 import shutil
@@ -12,8 +11,6 @@ import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
-from itertools import islice
 from pathlib import Path
 
 from memmlp.common.errors import InputError
@@ -25,7 +22,6 @@ from memmlp.runs.run import Run
 
 MAX_FILES = 1000
 MAX_SIZE = 4 * 10**9  # default limit for the total size of all files, bytes
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 PART = r"\w[\w.-]{0,99}"  # a folder or file name; not ".."
 PATTERNS = {*Run.FILES, "notes.json", "DONE"} - {"FAILED", "STOP", "PRIORITY"}
 ALLOWED = re.compile("|".join(re.escape(pattern).replace(r"\*", PART) for pattern in sorted(PATTERNS)))
@@ -52,25 +48,19 @@ def export_run(run: Run, out: Path) -> str:
 
 
 def import_run(
-    path: Path,
-    outputs: Path,
-    sha256: str | None = None,
-    max_size: int = MAX_SIZE,
-    report: Callable[[str], None] = lambda line: None,
+    path: Path, outputs: Path, sha256: str | None = None, max_size: int = MAX_SIZE
 ) -> tuple[Run, bool]:
     """Add the run in an archive to an outputs folder; return the run, and whether it is new. An existing run
-    with the same weights is left unchanged; then `report` gets a line if it lacks evaluations or deployments.
-    `sha256` is the required digest, `max_size` the allowed total size of all files, bytes. Raises InputError
-    if the file is not an archive of a run, is too large, or a digest is wrong."""
+    with the same weights is left unchanged. `sha256` is the required digest, `max_size` the allowed total
+    size of all files, bytes. Raises InputError if the file is not an archive of a run, is too large, or a
+    digest is wrong."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if sha256 is not None and file_digest(path) != sha256.lower():
         raise InputError(f"{path}: must have the SHA-256 {sha256}, but has {file_digest(path)}")
     try:
-        _check_member_count(path)
         with zipfile.ZipFile(path) as archive:
-            run_id, names = _check_names(archive, path, max_size)
-            run, new = _move_to_runs(archive, path, run_id, outputs)
+            return _move_to_runs(archive, path, _check_names(archive, path, max_size), outputs)
     except InputError:
         raise
     except OSError as error:
@@ -79,33 +69,22 @@ def import_run(
         raise InputError(f"{path}: must be an archive of a run ({error.strerror})") from None
     except (zipfile.BadZipFile, zlib.error, struct.error, RuntimeError, EOFError, ValueError) as error:
         raise InputError(f"{path}: must be an archive of a run ({error})") from None
-    missing = (name for name in names if "/" in name and not (run.folder / name).exists())
-    if not new and (more := sorted({"/".join(name.split("/")[:2]) for name in missing})):
-        report(f"{path}: also contains {', '.join(more)}; not added, since run {run.id} already exists")
-    return run, new
 
 
-def _check_member_count(path: Path) -> None:
-    """Raise InputError for an archive with too many members, before `zipfile` lists them in memory."""
-    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        if next(islice(re.finditer(rb"PK\x01\x02", content), MAX_FILES, None), None):
-            raise InputError(f"{path}: must be an archive of a run with at most {MAX_FILES} files")
-
-
-def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> tuple[str, list[str]]:
+def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> str:
     every = archive.namelist()
     run_id = every[0].partition("/")[0] if every else ""
-    if len(every) > MAX_FILES or len(set(every)) != len(every) or not ID.fullmatch(run_id):
+    if len(every) > MAX_FILES:
+        raise InputError(f"{path}: must be an archive of a run with at most {MAX_FILES} files")
+    if len(set(every)) != len(every) or not ID.fullmatch(run_id):
         raise InputError(f"{path}: must be an archive with one run folder, named by 16 hex digits")
     for name in every:
         folder, _, file = name.partition("/")
         if folder != run_id or not ALLOWED.fullmatch(file):
             raise InputError(f"{path}: {name!r} is not a file of run {run_id}")
-    if any(one.compress_type not in METHODS for one in archive.infolist()):
-        raise InputError(f"{path}: must be stored or deflated, as memmlp runs export does")
     if (total := sum(one.file_size for one in archive.infolist())) > max_size:
         raise InputError(f"{path}: must be at most {max_size / 1e9:.1f} GB (--max-gb), not {total / 1e9:.1f}")
-    return run_id, [name.partition("/")[2] for name in every]
+    return run_id
 
 
 def _move_to_runs(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Path) -> tuple[Run, bool]:
@@ -130,7 +109,6 @@ def _move_to_runs(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Pa
 
 
 def _check_unpacked_run(run: Run, path: Path) -> None:
-    """Raise InputError if the unpacked files are not a finished, unchanged run."""
     if damage := run.damage:
         raise InputError(f"{path}: {damage[0].removeprefix(f'{run.folder}/')}")
     if not run.done or run.manifest.get("id") != run.id or not run.config:

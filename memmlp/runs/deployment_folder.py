@@ -22,8 +22,7 @@ FILES = (LATENCY, *ONNX_FILES.values())
 
 
 class DeploymentFolder:
-    """A deployment of a run: the folder runs/<id>/deployments/<identity>/. Its measurements (`latency`) are
-    written last; the int8 file may not exist."""
+    """A deployment of a run: the folder runs/<id>/deployments/<identity>/. `latency` is written last."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -83,8 +82,7 @@ class DeploymentFolder:
 
 
 def is_accurate_enough(cost: Mapping[str, Any]) -> bool:
-    """Return whether a lower precision can replace float32, given the relative "growth" and "jitter_growth"
-    of its errors. Missing and NaN count as inaccurate."""
+    """Return whether a lower precision can replace float32, given the relative growth of its errors."""
     growth, jitter = (to_number(cost.get(name, math.inf)) for name in ("growth", "jitter_growth"))
     return growth <= MAX_GROWTH and jitter <= MAX_JITTER_GROWTH
 
@@ -102,23 +100,18 @@ def select_deployed_measurements(latency: Mapping[str, Any]) -> dict[str, Any]:
 
 def replace_with_deployed_times(results: Mapping[str, Any]) -> dict[str, Any]:
     """Return a run's results with each deployment's numbers replaced by those of the requested precision."""
-
-    def merge(latency: Mapping[str, Any]) -> dict[str, Any]:
-        deployed = select_deployed_measurements(latency)
-        return {
-            key: deployed[key] if isinstance(value, int | float) else value for key, value in latency.items()
-        }
-
-    return {
-        name: merge(one) if name.startswith("latency") and isinstance(one, Mapping) else one
-        for name, one in results.items()
-    }
+    replaced = dict(results)
+    for name, latency in results.items():
+        if name.startswith("latency") and isinstance(latency, Mapping):
+            deployed = select_deployed_measurements(latency)
+            numbers = {key for key, value in latency.items() if isinstance(value, int | float)}
+            replaced[name] = {**latency, **{key: deployed[key] for key in numbers}}
+    return replaced
 
 
 def describe_timing_machine(record: Mapping[str, Any]) -> str:
     """Return the processor and ONNX Runtime version of a deployment's measurements; "?" if unknown."""
     made_by = record.get("made_by") or {}
     runtime = (made_by.get("packages") or {}).get("onnxruntime")
-    if not made_by.get("cpu"):
-        return "?"
-    return f"{made_by['cpu']}, ONNX Runtime {runtime}" if runtime else str(made_by["cpu"])
+    cpu = made_by.get("cpu") or "?"
+    return f"{cpu}, ONNX Runtime {runtime}" if runtime and cpu != "?" else cpu

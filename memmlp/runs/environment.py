@@ -75,9 +75,8 @@ def _run_git(*args: str) -> str:
 
 @functools.cache
 def create_code_patch() -> str:
-    """Return a patch from the package's commit to the code of this process, and the names of untracked files.
-    It is empty without modifications or outside a git checkout, and created once, since later edits do not
-    run."""
+    """Return a patch from the package's commit to the code of this process, and the names of untracked files;
+    empty without modifications or outside a git checkout. Later edits are ignored, since they do not run."""
     git = _describe_commit()
     if not git or not git["dirty"]:
         return ""
@@ -89,15 +88,14 @@ def create_code_patch() -> str:
 
 
 def compute_code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
-    """Return a code digest for each file that affects the numbers of a run (`compute_code_digest`). Files of
-    users' packages are named PACKAGE:FILE."""
+    """Return the code digest of each file that affects a run's numbers; PACKAGE:FILE for users' packages."""
     return {name: compute_code_digest(content) for name, content in read_code_files(packages).items()}
 
 
 def read_code_files(packages: Iterable[str] = ()) -> dict[str, bytes]:
     """Return the content of each file that affects the numbers of a run, as this process runs it."""
-    users = _read_user_files(packages).items()
-    return _read_package_code() | {f"{name}:{file}": files[file] for name, files in users for file in files}
+    users = {f"{name}:{file}": code for name in packages for file, code in _read_user_files(name).items()}
+    return _read_package_code() | users
 
 
 def describe_sources(packages: Iterable[str] = ()) -> dict[str, dict[str, str]]:
@@ -136,19 +134,16 @@ def list_differing_files(before: Mapping[str, str], after: Mapping[str, str]) ->
 
 @functools.cache
 def _read_package_code() -> dict[str, bytes]:
-    files = {path.relative_to(PACKAGE): path for path in sorted(PACKAGE.rglob("*.py"))}
-
-    def affects_results(path: Path) -> bool:
-        unused = path.parts[0].startswith("_") or any(map(path.is_relative_to, NOT_NUMBERS))
-        return path.as_posix() in WIRING or not unused
-
-    return {name.as_posix(): path.read_bytes() for name, path in files.items() if affects_results(name)}
+    names = [path.relative_to(PACKAGE) for path in sorted(PACKAGE.rglob("*.py"))]
+    unused = [one for one in names if one.parts[0][0] == "_" or any(map(one.is_relative_to, NOT_NUMBERS))]
+    counting = [one for one in names if one not in unused or one.as_posix() in WIRING]
+    return {name.as_posix(): (PACKAGE / name).read_bytes() for name in counting}
 
 
 @functools.cache
 def compute_code_digest(code: bytes) -> str:
-    """Return a digest (12 hex digits) of Python code without layout, comments and docstrings; of its bytes if
-    it can't be parsed."""
+    """Return a digest (12 hex digits) of Python code, or of bytes, without layout, comments and
+    docstrings."""
     try:
         tree = ast.parse(code.decode())
     except (SyntaxError, ValueError):
@@ -159,17 +154,16 @@ def compute_code_digest(code: bytes) -> str:
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
 
 
-def _read_user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
-    """Return the content of all Python files in users' packages, by package and file; empty if not found."""
-    listed = {name: _list_package_files(name).items() for name in packages}
-    return {name: {file: _read_user_code(path) for file, path in files} for name, files in listed.items()}
+def _read_user_files(package: str) -> dict[str, bytes]:
+    """Return the content of all Python files in a user's package, by file; empty if it is not found."""
+    return {file: _read_user_code(path) for file, path in _list_package_files(package).items()}
 
 
 def describe_user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
     """Return the version and code digest of each user's package, by name."""
     found: dict[str, dict[str, str | None]] = {}
-    for name, files in _read_user_files(names).items():
-        digests = {file: compute_code_digest(code) for file, code in files.items()}
+    for name in names:
+        digests = {file: compute_code_digest(code) for file, code in _read_user_files(name).items()}
         digest = compute_byte_digest(repr(digests).encode())
         found[name] = {"version": _find_user_version(name), "digest": digest}
     return found

@@ -49,9 +49,8 @@ def is_current(path: Path, report: Mapping[str, Any]) -> bool:
     return {"mode", "ik"} <= settings.keys() and path.stem == hash_evaluation_settings(settings)
 
 
-def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
-    """Return the changed component versions of an evaluation, such as "mode.window 2 -> 3", or None. Custom
-    metrics from packages that are not in use are ignored."""
+def describe_outdated(report: Mapping[str, Any]) -> str | None:
+    """Return the changed component versions of an evaluation, such as "mode.window 2 -> 3", or None."""
     recorded = report.get("component_versions") or {}
     comparable = {name: number for name, number in recorded.items() if find_version(name)}
     return ", ".join(list_outdated(comparable)) or None
@@ -88,23 +87,17 @@ def keep_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]
 
 
 def add_solver_names(results: Mapping[str, Any], solvers: Mapping[str, str | None]) -> dict[str, Any]:
-    """Add the solver's name (by mode, `find_combined_solvers`) to the branch `combined`: "combined-
-    lbfgs-15"."""
-
-    def name_branch(mode: str, branch: str) -> str:
-        return f"{branch}-{solvers[mode]}" if branch == COMBINED and solvers.get(mode) else branch
-
-    return {
-        mode: {name_branch(mode, branch): errors for branch, errors in branches.items()}
-        if isinstance(branches, Mapping)
-        else branches
-        for mode, branches in results.items()
-    }
+    """Add the solver's name, by mode, to the branch `combined`: "combined-lbfgs-15"."""
+    named = dict(results)
+    for mode, solver in solvers.items():
+        if solver and isinstance(branches := results.get(mode), Mapping):
+            renamed = {COMBINED: f"{COMBINED}-{solver}"}
+            named[mode] = {renamed.get(branch, branch): errors for branch, errors in branches.items()}
+    return named
 
 
 class ConfiguredEvaluations:
-    """A run's evaluations that match the run's config. The preferred of the `paths` is last
-    (`make_preference_key`)."""
+    """A run's evaluations that match its config. The preferred path is last (`make_preference_key`)."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any]):
         every = {path: records.read(path, records.Evaluation) for path in sorted(folder.glob("*.json"))}
@@ -129,16 +122,14 @@ class ConfiguredEvaluations:
 
     @property
     def combined_solvers(self) -> dict[str, str | None]:
-        """The inverse kinematics of the branch `combined`, by mode, such as "arms"; None if unknown. Raises
-        InputError if a file is damaged."""
+        """The inverse kinematics of the branch `combined`, by mode. Raises InputError if a file is
+        damaged."""
         return find_combined_solvers(self._read_reports())
 
     @property
     def outdated(self) -> dict[str, str]:
         """The changed component versions, by mode; modes with current versions are left out."""
-        last = {
-            report.get("mode"): describe_outdated(path, report) for path, report in self._matching.items()
-        }
+        last = {report.get("mode"): describe_outdated(report) for report in self._matching.values()}
         return {str(mode): changed for mode, changed in last.items() if changed}
 
     def _read_reports(self) -> list[dict[str, Any]]:

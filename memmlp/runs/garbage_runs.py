@@ -27,8 +27,8 @@ class GarbageRun(NamedTuple):
 
 
 def find_garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[GarbageRun]:
-    """Find the runs that may be deleted for these REASONS. Runs in progress, runs with a tag or a note, and
-    prerequisites of remaining runs are never returned."""
+    """Find the runs that may be deleted for these REASONS, without runs in progress, noted runs and
+    prerequisites."""
     runs = list_runs(outputs)
     orphans, requested = _find_orphans(outputs, runs), set(kinds)
     candidates = {}
@@ -42,23 +42,28 @@ def find_garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[GarbageR
     return list(candidates.values())
 
 
-def delete(garbage_run: GarbageRun) -> bool:
-    """Delete a run's folder, its marker first. Returns False if the run is in use, or has tags or a note."""
+def delete_garbage(garbage_run: GarbageRun) -> bool:
+    """Delete a run's folder. Returns False if the run is in use, or has tags or a note."""
     run = garbage_run.run
     with run.lock(wait=False) as lease:
-        if not lease or _has_notes(run):
-            return False
-        run.reset()
-        shutil.rmtree(run.folder)
-    return True
+        if lease and not _has_notes(run):
+            _remove(run)
+    return not run.folder.exists()
+
+
+def _remove(run: Run) -> None:
+    run.reset()  # removes the marker first
+    shutil.rmtree(run.folder)
 
 
 def list_dependents(outputs: Path, run: Run) -> list[str]:
     """Return a line for each run that was trained from this run, and for each sweep or search with it."""
-    needing = [one.id for one in list_runs(outputs) if one.manifest.get("prerequisite") == run.id]
-    plans = [path.parent.name for path in _list_plans(outputs) if run.id in _read_planned_ids(path)]
-    lines = [f"run {name} was trained from it" for name in needing]
-    return lines + [f"sweep {name} contains it" for name in plans]
+    trained_from_it = [one for one in list_runs(outputs) if one.manifest.get("prerequisite") == run.id]
+    plans = [path for path in _list_plans(outputs) if run.id in _read_planned_ids(path)]
+    return [
+        *(f"run {one.id} was trained from it" for one in trained_from_it),
+        *(f"sweep {path.parent.name} contains it" for path in plans),
+    ]
 
 
 def delete_run(outputs: Path, run: Run, by: str = "command line") -> None:
@@ -66,8 +71,7 @@ def delete_run(outputs: Path, run: Run, by: str = "command line") -> None:
     with run.lock(wait=False) as lease:
         if not lease:
             raise InputError(f"run {run.id}: must not be in use; stop it first: memmlp runs stop {run.id}")
-        run.reset()
-        shutil.rmtree(run.folder)
+        _remove(run)
     log_action(outputs, "delete", run.id, by)
 
 
@@ -86,8 +90,7 @@ def _find_deletion_reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, st
 
 
 def _find_orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
-    """Return the reason why a run is an orphan, by run id: a prerequisite run that is in no plan and that no
-    run uses, or a folder of a run that never started."""
+    """Return why runs are orphans, by id: an unused prerequisite run, or a run that never started."""
     planned = {run_id for path in _list_plans(outputs) for run_id in _read_planned_ids(path)}
     used = _list_prerequisites(runs) | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}

@@ -119,8 +119,7 @@ EXPORTED = {"graph": "auto", "precision": "fp32", "opset": 18}
 @dataclass(frozen=True)
 class Identity:
     """The identity of a run: its `kind` (NETWORK, "vqvae" or the name of the trained part), resolved
-    `config`, digest of the prepared `data`, and the run that provides its weights. Neutral keys and keys of
-    later stages are ignored, and 1 equals 1.0."""
+    `config`, digest of the prepared `data`, and the run that provides its weights."""
 
     kind: str
     config: Mapping[str, Any]
@@ -194,8 +193,7 @@ def select_evaluation_settings(
 
 
 def get_solver_name(settings: Mapping[str, Any]) -> str | None:
-    """Return the name of the inverse kinematics in evaluation settings, such as "arms" or "lbfgs-15", or
-    None."""
+    """Return the name of the inverse kinematics, such as "arms" or "lbfgs-15", or None."""
     ik, iterations = settings.get("ik", "off"), settings.get("ik_iterations")
     if ik in (None, "off"):
         return None

@@ -33,8 +33,8 @@ def list_runs(outputs: Path | str) -> list[Run]:
 
 
 def find_run(outputs: Path | str, name: str) -> Run:
-    """Find a run by its id, the first digits of its id, its folder, or the name of a shipped network. Raises
-    InputError unless one run matches."""
+    """Find a run by its id, its first digits, its folder, or a shipped network's name. Raises InputError
+    without one."""
     is_folder = bool(name) and (Path(name) / "manifest.json").is_file()
     if is_folder and ("/" in name or not ID.fullmatch(name)):
         return Run(Path(name).resolve())
@@ -100,8 +100,8 @@ def count_training_frames(run: Run) -> float:
 
 
 def warn_if_hardly_trained(frames: float) -> str:
-    """Return a warning if a network saw less than half an hour of motion in training (`frames`; 0 if
-    unknown)."""
+    """Return a warning if a network saw less than half an hour of motion (`frames`; 0 if unknown) in
+    training."""
     if not 0 < frames < LITTLE:
         return ""
     return f"hardly trained (its steps saw {frames / MINUTE:.2g} minutes of motion): ignore its errors"
@@ -133,38 +133,36 @@ def read_notes(run: Run) -> Notes:
     return Notes(tags, content.get("note", ""), content.get("name", ""), content.get("archived", False))
 
 
+def edit_notes(run: Run, **changes: Any) -> Notes:
+    """Replace fields of a run's notes, and return them. Raises InputError for an invalid tag, note or
+    name."""
+    notes = replace(read_notes(run), **changes)
+    notes = replace(
+        notes, tags=tuple(sorted(set(notes.tags))), note=notes.note.strip(), name=notes.name.strip()
+    )
+    if bad := [tag for tag in notes.tags if not TAG.fullmatch(tag)]:
+        raise InputError(f"tag '{bad[0]}': must be up to 64 letters, digits and . _ + / : -")
+    if len(notes.note) > MAX_LENGTH:
+        raise InputError(f"note: must have at most {MAX_LENGTH} characters, but has {len(notes.note)}")
+    if len(notes.name) > MAX_NAME or not notes.name.isprintable():
+        raise InputError(f"name: must have at most {MAX_NAME} printable characters")
+    fields = {key: value for key, value in asdict(notes).items() if value or key in ("tags", "note")}
+    write_json(get_notes_path(run), fields)
+    return notes
+
+
 def add_tags(run: Run, tags: Iterable[str]) -> Notes:
     """Add tags to a run. Raises InputError for an invalid tag."""
-    notes = read_notes(run)
-    return _write_notes(run, replace(notes, tags=tuple(sorted({*notes.tags, *map(_check_tag, tags)}))))
+    return edit_notes(run, tags=(*read_notes(run).tags, *tags))
 
 
 def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
     """Remove tags from a run. Raises InputError for a tag that the run does not have."""
-    notes, removed = read_notes(run), set(tags)
-    if missing := sorted(removed - set(notes.tags)):
-        existing = ", ".join(notes.tags) or "none"
+    before, removed = read_notes(run).tags, set(tags)
+    if missing := sorted(removed - set(before)):
+        existing = ", ".join(before) or "none"
         raise InputError(f"tag '{missing[0]}': run {run.id} does not have this tag; its tags: {existing}")
-    return _write_notes(run, replace(notes, tags=tuple(tag for tag in notes.tags if tag not in removed)))
-
-
-def set_note(run: Run, note: str) -> Notes:
-    """Replace a run's note; an empty note removes it. Raises InputError if the note is too long."""
-    if len(note) > MAX_LENGTH:
-        raise InputError(f"note: must have at most {MAX_LENGTH} characters, but has {len(note)}")
-    return _write_notes(run, replace(read_notes(run), note=note.strip()))
-
-
-def _check_tag(tag: str) -> str:
-    if not TAG.fullmatch(tag):
-        raise InputError(f"tag '{tag}': must be up to 64 letters, digits and . _ + / : -")
-    return tag
-
-
-def _write_notes(run: Run, notes: Notes) -> Notes:
-    fields = {key: value for key, value in asdict(notes).items() if value or key in ("tags", "note")}
-    write_json(get_notes_path(run), fields)
-    return notes
+    return edit_notes(run, tags=set(before) - removed)
 
 
 ACTIONS = ("stop", "retry", "prioritize", "unprioritize", "archive", "restore", "name", "note", "tags")
@@ -190,16 +188,11 @@ def change_run(run: Run, action: str, value: str = "", by: str = "command line")
         case "prioritize" | "unprioritize":
             run.prioritize(action == "prioritize")
         case "archive" | "restore":
-            _write_notes(run, replace(read_notes(run), archived=action == "archive"))
-        case "name":
-            if len(value) > MAX_NAME or not value.isprintable():
-                raise InputError(f"name: must have at most {MAX_NAME} printable characters")
-            _write_notes(run, replace(read_notes(run), name=value.strip()))
-        case "note":
-            set_note(run, value)
+            edit_notes(run, archived=action == "archive")
+        case "name" | "note":
+            edit_notes(run, **{action: value})
         case "tags":
-            tags = tuple(sorted({_check_tag(tag) for tag in value.split()}))
-            _write_notes(run, replace(read_notes(run), tags=tags))
+            edit_notes(run, tags=value.split())
         case _:
             raise InputError(f"action={action}: must be one of {', '.join(ACTIONS)}")
     log_action(run.folder, action, value, by)

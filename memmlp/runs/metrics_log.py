@@ -12,7 +12,8 @@ from typing import NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, make_json_safe
 from memmlp.common.lease import check_owner
-from memmlp.runs.records import parse_log_entry
+from memmlp.common.schema import check_type, parse_json
+from memmlp.runs.records import LogEntry
 
 MAX_BYTES = 64 * 2**20
 TAIL_BYTES = 2**12  # searched for recent records
@@ -30,7 +31,8 @@ class LogRecord(NamedTuple):
 
 def parse_record(line: bytes) -> LogRecord:
     """Parse a line of the log. Raises ValueError if it is not a record."""
-    entry = parse_log_entry(line)
+    entry = parse_json(line)
+    check_type(entry, LogEntry)
     values = {key: float(value) for key, value in entry["values"].items()}
     return LogRecord(entry["step"], entry["phase"], values, entry["time"])
 

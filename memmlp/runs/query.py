@@ -1,15 +1,14 @@
 """Parses conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and collects the values of runs. A
 condition consists of comparisons, `and` and `or`; `and` binds more tightly."""
 
-import difflib
 import operator
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, suggest
 from memmlp.common.files import to_number
-from memmlp.common.overrides import flatten
+from memmlp.common.overrides import flatten, format_value
 from memmlp.runs.identity import SLOTS, find_option, select_training_config
 from memmlp.runs.lookup import get_run_name, read_notes
 from memmlp.runs.run import STATUSES, Run
@@ -17,11 +16,13 @@ from memmlp.runs.run import STATUSES, Run
 Record = Mapping[str, Any]
 Condition = Callable[[Record], bool]
 
-TOKEN = re.compile(r"""\s*(?:(?P<op><=|>=|!=|==|[=<>])|"(?P<quoted>[^"]*)"|(?P<word>[^\s<>=!"]+))""")
+COMPARISON = re.compile(
+    r'([^\s<>=!"]+)\s*(<=|>=|!=|==|[=<>])\s*(?:"(?P<quoted>[^"]*)"|(?P<word>[^\s<>=!"]+))\s*'
+)
+JUNCTION = re.compile(r"(and|or)(?:\s+|$)")
 ORDER: dict[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
 }  # fmt: skip
-COMPARISONS = ("=", "==", "!=", *ORDER)
 SHORT = 8  # number of digits in a shortened digest
 
 
@@ -86,7 +87,6 @@ def list_differing_keys(configs: Sequence[Mapping[str, Any]], data: Sequence[str
 
 
 def _list_differing_data_keys(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[str]:
-    """Return the `data` keys that differ between data sets with the same name."""
     named: dict[Any, dict[str, Mapping[str, Any]]] = {}
     for flat, digest in zip(flats, digests, strict=False):
         named.setdefault(flat.get("data.name"), {}).setdefault(digest, flat)
@@ -102,22 +102,16 @@ def format_typed_value(value: Any) -> str:
     """Format a value for a condition or a table column."""
     if isinstance(value, list | tuple):
         return f"[{','.join(map(format_typed_value, value))}]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return "null" if value is None else str(value)
+    return f"{value:.4g}" if isinstance(value, float) else format_value(value)
 
 
 def check_key(key: str, records: Iterable[Record], option: str) -> None:
     """Raise InputError if no record has the key."""
     keys = {name for one in records for name in one}
     if key not in keys:
-        near = difflib.get_close_matches(key, keys, n=1)
-        hint = f"did you mean {near[0]}? " if near else ""
         raise InputError(
-            f"{option}: no run has the key '{key}'; {hint}use a config key (memory, optim.lr), a result "
-            "(stream.MPJPE), id, kind, status, name, data, started, tag or note"
+            f"{option}: no run has the key '{key}'; {suggest(key, keys)}use a config key (memory, "
+            "optim.lr), a result (stream.MPJPE), id, kind, status, name, data, started, tag or note"
         )
 
 
@@ -129,95 +123,79 @@ class Query(NamedTuple):
     keys: tuple[str, ...]
     numbers: tuple[str, ...]
 
-    def match_records(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
-        """Return, for each record, whether it satisfies the condition. Raises InputError if a key is unknown,
-        or if a key in `numbers` has text values only."""
+    def match_records(self, records: Sequence[Record]) -> list[bool]:
+        """Return which records satisfy the condition. Raises InputError if a key is unknown, or not a number
+        for < or >."""
         for key in self.keys if records else ():
-            check_key(key, records, option)
+            check_key(key, records, "--where")
         for key in self.numbers:
             values = [one[key] for one in records if key in one]
             if values and all(isinstance(value, str | list | tuple) for value in values):
                 value = format_typed_value(values[0])
-                raise InputError(f"{option}: {key} must be a number for < or >, but is {value}; use = or !=")
+                raise InputError(f"--where: {key} must be a number for < or >, but is {value}; use = or !=")
         return [self.condition(one) for one in records]
 
 
 def parse_query(text: str) -> Query:
     """Parse a condition. Raises InputError if it is not valid."""
-    tokens = _Tokens(text)
+
+    def fail(expected: str, found: str) -> InputError:
+        shown = f"'{found[:20]}'" if found else "the end"
+        return InputError(
+            f"--where '{text}': expected {expected}, but found {shown}; use comparisons "
+            "(= != < <= > >=), and, or"
+        )
+
     groups: list[list[Condition]] = [[]]
+    keys, numbers, rest = list[str](), list[str](), text.strip()
     while True:
-        groups[-1].append(tokens.read_comparison())
-        if tokens.is_at_end:
-            break
-        if (word := tokens.read_token("and or or")[1]) not in ("and", "or"):
-            raise tokens.make_error(f"expected and or or, but found '{word}'")
-        if word == "or":
-            groups.append([])
-    keys, numbers = tuple(dict.fromkeys(tokens.keys)), tuple(dict.fromkeys(tokens.numbers))
-    return Query(lambda one: any(all(part(one) for part in group) for group in groups), keys, numbers)
-
-
-class _Tokens:
-    def __init__(self, text: str):
-        self.text, self.rest = text, text.strip()
-        self.keys: list[str] = []
-        self.numbers: list[str] = []
-
-    @property
-    def is_at_end(self) -> bool:
-        return not self.rest
-
-    def read_token(self, expected: str) -> tuple[str, str]:
-        """Return the kind and text of the next token."""
-        if self.is_at_end:
-            raise self.make_error(f"expected {expected} at the end")
-        match = TOKEN.match(self.rest)
-        if match is None:
-            raise self.make_error(f"'{self.rest[:20]}' cannot be parsed")
-        self.rest = self.rest[match.end() :].strip()
-        return match.lastgroup or "", match[match.lastgroup or 0]
-
-    def read_comparison(self) -> Condition:
-        """Return the condition of the next comparison, and record its key."""
-        kind, key = self.read_token("a key")
-        if kind != "word" or key in ("and", "or"):
-            raise self.make_error(f"expected a key, but found '{key}'")
-        _, sign = self.read_token(f"a comparison after {key}")
-        if sign not in COMPARISONS:
-            raise self.make_error(f"expected a comparison after {key}, but found '{sign}'")
-        kind, value = self.read_token(f"a value after {key}{sign}")
-        if kind == "op":
-            raise self.make_error(f"expected a value after {key}{sign}, but found '{value}'")
-        if sign in ORDER and _parse_number(value) is None and key != "started":
-            raise self.make_error(f"expected a number after {key}{sign}, but found '{value}'")
+        match = COMPARISON.match(rest)
+        if match is None or match[1] in ("and", "or"):
+            raise fail("a comparison", rest)
+        key, sign, value = match[1], match[2], match["quoted"] or match["word"] or ""
+        keys.append(key)
+        if sign in ORDER and key != "started":
+            numbers.append(key)
+            if _parse_number(value) is None:
+                raise fail(f"a number after {key}{sign}", value)
         if key == "status" and value not in STATUSES:
             statuses = ", ".join(STATUSES)
-            raise InputError(f"--where '{self.text}': status={value} must be one of {statuses}")
-        self.keys.append(key)
-        if key == "started" and sign in ORDER:  # ISO 8601 times, which may be typed in part, like 2025-03
-            return lambda one: bool(one.get(key)) and ORDER[sign](str(one[key]), value)
-        self.numbers += [key] if sign in ORDER else []
-        return lambda one: _is_satisfied(one.get(key), sign, value)
+            raise InputError(f"--where '{text}': status={value} must be one of {statuses}")
+        groups[-1].append(_make_condition(key, sign, value))
+        if not (rest := rest[match.end() :]):
+            break
+        if (junction := JUNCTION.match(rest)) is None:
+            raise fail("and or or", rest)
+        rest = rest[junction.end() :]
+        if junction[1] == "or":
+            groups.append([])
+    return Query(
+        lambda one: any(all(part(one) for part in group) for group in groups),
+        tuple(dict.fromkeys(keys)),
+        tuple(dict.fromkeys(numbers)),
+    )
 
-    def make_error(self, reason: str) -> InputError:
-        return InputError(f"--where '{self.text}': {reason}; use comparisons (= != < <= > >=), and, or")
+
+def _make_condition(key: str, sign: str, value: str) -> Condition:
+    """Return the condition of a comparison; with a missing value or NaN, < and > are false."""
+    if sign not in ORDER:
+        return lambda one: _is_equal(one.get(key), value) == (sign != "!=")
+    compare = ORDER[sign]
+    if key == "started":  # ISO 8601 times, which may be typed in part, like 2025-03
+        return lambda one: bool(one.get(key)) and compare(str(one[key]), value)
+    number = float(value)
+    return lambda one: _is_number(one.get(key)) and compare(one[key], number)
 
 
-def _is_satisfied(actual: Any, sign: str, value: str) -> bool:
-    """Return whether a comparison is true; with a missing value or NaN, < and > are false."""
-    if sign in ORDER:
-        number = _parse_number(value)
-        comparable = isinstance(actual, int | float) and not isinstance(actual, bool)
-        return comparable and number is not None and ORDER[sign](actual, number)
-    return _is_equal(actual, value) == (sign != "!=")
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _is_equal(actual: Any, value: str) -> bool:
     """Return whether a run's value equals a typed value, which may be rounded like in tables."""
     if isinstance(actual, tuple):  # the tags of a run
         return value in actual
-    if isinstance(actual, int | float) and not isinstance(actual, bool):
+    if _is_number(actual):
         return _parse_number(value) in (actual, float(format_typed_value(actual)))
     typed = value.lower() if isinstance(actual, bool | None) else value.replace(", ", ",")
     return format_typed_value(actual) == typed

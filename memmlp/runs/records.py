@@ -88,13 +88,12 @@ Group = dict[str, Any] | None
 Component = _record(name=str, frames=int | None, steps=int | None, batch=int | None, tflop=float | None)
 Data = _record(name=str, split=Group, sources=dict[str, dict[str, Any]] | None, synth=Group)
 Evaluating = _record(ik=str | bool | None, modes=list[str], metrics=list[str] | None)
-CONFIG = {
-    "plugins": list[str] | None, "data": Data | None, "vqvae": Component | None, "evaluation": Evaluating,
-    "loggers": dict[str, Group] | None, **dict.fromkeys(("paths", "profile"), Group),
-    **dict.fromkeys(("normalizer", "export"), dict[str, Any]), **dict.fromkeys(SLOTS, Component | None),
-    "optim": Component,
-}  # fmt: skip
-Config = _record(**CONFIG)
+Config = _record(
+    plugins=list[str] | None, data=Data | None, vqvae=Component | None, evaluation=Evaluating,
+    loggers=dict[str, Group] | None, optim=Component,  # type: ignore[valid-type]
+    **dict.fromkeys(("paths", "profile"), Group), **dict.fromkeys(("normalizer", "export"), dict[str, Any]),
+    **dict.fromkeys([slot for slot in SLOTS if slot != "optim"], Component | None),
+)  # fmt: skip
 
 # evaluations/ID.json and deployments/ID/latency.json
 Settings = _record(
@@ -204,10 +203,3 @@ def compute_digest(content: Mapping[str, Any]) -> str:
     """Return the digest of an evaluation's content, 16 hex digits."""
     content = {key: value for key, value in content.items() if key != "digest"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def parse_log_entry(line: bytes) -> dict[str, Any]:
-    """Parse a line of a metrics log. Raises ValueError if it is not valid."""
-    entry = parse_json(line)
-    check_type(entry, LogEntry)
-    return entry  # type: ignore[no-any-return]

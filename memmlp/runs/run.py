@@ -46,16 +46,8 @@ STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment":
 STOPPED = "stopped on request"
 
 STATUSES = (
-    *STAGE_WORDS.values(),
-    "done",
-    "trained",
-    "lost",
-    "failed",
-    "damaged",
-    "stopped",
-    "interrupted",
-    "new",
-)
+    *STAGE_WORDS.values(), "done", "trained", "lost", "failed", "damaged", "stopped", "interrupted", "new",
+)  # fmt: skip
 """The statuses of runs (`Run.state`)."""
 
 
@@ -65,26 +57,15 @@ def name_latency(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
 
 
 class Run:
-    """A run: the folder outputs/runs/<id>/. An id has 16 hex digits. `results_path` has the results of a
-    VQ-VAE; `marker` marks the run as done."""
+    """A run: the folder outputs/runs/<id>/. `results_path` has a VQ-VAE's results; `marker` marks the run as
+    done."""
 
     STAGES = (*(f"deployments/*/{name}" for name in deployment_folder.FILES), "evaluations/*.json")
     """The files of a run's evaluations and deployments."""
     FILES = (
-        *STAGES,
-        "checkpoint.safetensors",
-        "model.safetensors",
-        "results.json",
-        "metrics.jsonl",
-        "poses.png",
-        "log.txt",
-        "FAILED",
-        "STOP",
-        "PRIORITY",
-        "code.patch",
-        "config.yaml",
-        "manifest.json",
-    )
+        *STAGES, "checkpoint.safetensors", "model.safetensors", "results.json", "metrics.jsonl", "poses.png",
+        "log.txt", "FAILED", "STOP", "PRIORITY", "code.patch", "config.yaml", "manifest.json",
+    )  # fmt: skip
     """All files of a run in order of removal: results before the files on which they depend."""
 
     def __init__(self, folder: Path | str):
@@ -140,9 +121,8 @@ class Run:
 
     @property
     def preferred_deployment(self) -> DeploymentFolder:
-        """The deployment for live use; it uses the network in the same way as the run's config. The order of
-        preference is: current component versions, an accurate int8 file, the export settings of the config,
-        the latest."""
+        """The deployment for live use, like the run's config. The order of preference is: current component
+        versions, an accurate int8 file, the export settings of the config, the latest."""
         config = self.config
         return self._find_best_deployment(
             config,
@@ -179,9 +159,8 @@ class Run:
 
     @property
     def preferred_onnx(self) -> Path:
-        """The ONNX file for live use: int8 if it is accurate enough (`export.precision`), otherwise float32.
-        Raises InputError if a finished run does not have one (`export.graph=off`), or if it has changed since
-        the export."""
+        """The ONNX file for live use: int8 if it is accurate enough, otherwise float32. Raises InputError if
+        a finished run does not have one (`export.graph=off`), or if it has changed."""
         deployment = self.preferred_deployment
         if self.done and not self.deployments.is_dir():
             make = join_command(["memmlp", "eval", str(self.folder), "export.graph=auto"])
@@ -192,20 +171,12 @@ class Run:
             raise InputError(f"{file}: changed since it was exported; repeat the run with force=true")
         return file
 
-    @property
-    def onnx(self) -> Path:
-        """The float32 ONNX file of `preferred_deployment`."""
-        return self.preferred_deployment.onnx
-
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r})"
 
-    def lock(
-        self, report: Callable[[str], None] | None = None, wait: bool = True
-    ) -> AbstractContextManager[Lease | None]:
-        """Hold the run's lock during the context, and yield the lease; see
-        `memmlp.common.lease.Lock.hold`."""
-        return self._lock.hold(report, wait)
+    def lock(self, wait: bool = True) -> AbstractContextManager[Lease | None]:
+        """Hold the run's lock during the context, and yield the lease (`Lock.hold`)."""
+        return self._lock.hold(wait)
 
     @property
     def status(self) -> str:
@@ -223,7 +194,7 @@ class Run:
     @property
     def activity(self) -> str | None:
         """The current activity: training, evaluating or exporting; None if no process works on the run."""
-        if not self._lock.is_held:
+        if not self.is_held:
             return None
         attempts = self.manifest.get("attempts") or [{}]
         word = STAGE_WORDS.get(attempts[-1].get("stage"), "training")
@@ -235,7 +206,7 @@ class Run:
         requested evaluation or deployment is missing), stopped (on request), interrupted, new."""
         if complete and not self.damage:
             return "done"
-        held = self._lock.is_held
+        held = self.is_held
         if self.is_stop_requested and not held and not self.failure:
             return "stopped"
         if held is not None:
@@ -274,11 +245,8 @@ class Run:
     @property
     def fault(self) -> str | None:
         """The reason why the run failed, or else its damaged record or a request to stop; otherwise None."""
-        return self.failure or next(iter(self.damage), self._stop_fault)
-
-    @property
-    def _stop_fault(self) -> str | None:
-        return STOPPED if self.is_stop_requested and not self.complete else None
+        stopped = STOPPED if self.is_stop_requested and not self.complete else None
+        return self.failure or next(iter(self.damage), stopped)
 
     def check_records(self) -> None:
         """Raise InputError if a record of the run cannot be read."""
@@ -347,9 +315,8 @@ class Run:
         self, kind: str, config: Mapping[str, Any], *, data: str, prerequisite: str | None, **facts: Any
     ) -> None:
         """Write config.yaml and the manifest of a run that starts or resumes, and a patch of uncommitted
-        changes of the code. `kind` is that of `Identity`, `data` the digest of the prepared data,
-        `prerequisite` the id of the run that provides weights. `facts` are further manifest entries, such as
-        component versions, device and threads."""
+        changes. `kind` is that of `Identity`, `data` the data's digest, `prerequisite` the id of the run that
+        provides weights. `facts` are further manifest entries."""
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
         if patch := create_code_patch():
@@ -380,8 +347,7 @@ class Run:
         self.write_manifest({"attempts": [*self.manifest.get("attempts", []), attempt]})
 
     def write_manifest(self, fields: Mapping[str, Any]) -> None:
-        """Add or replace fields of the manifest. Raises InputError if it can't be read, since its content
-        would be lost."""
+        """Add or replace fields of the manifest. Raises InputError if it can't be read."""
         manifest = records.load(self.manifest_path, records.Manifest)
         write_json(self.manifest_path, manifest | dict(fields))
 
@@ -427,8 +393,7 @@ class Run:
 
     @property
     def changed_sources(self) -> list[str]:
-        """The code files, also of users' packages, that have changed since the run began; empty if
-        unknown."""
+        """The code files, also of users' packages, that have changed since the run began."""
         return list_changed_files(self.manifest)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:

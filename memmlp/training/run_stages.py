@@ -211,7 +211,7 @@ def record_outcome(experiment: Experiment, run: Run, again: bool = False) -> Ite
     bad input, interruptions, a full disk, a closed output pipe, or the loss of the run to another process."""
     missing = again or not run.done or not all(map(run.has, experiment.stage_ids))
     missing = missing or bool(list_missing_modes(experiment, run))
-    loggers = experiment.loggers if missing else Loggers((), experiment.outputs)
+    loggers = experiment.loggers if missing else Loggers()
     with loggers.show_run(run), keep_announcements(run.log_path):
         try:
             yield

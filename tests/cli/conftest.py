@@ -1,5 +1,6 @@
 """Sweeps that need no runs, the tiny run, and clips of random motion."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,12 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         found = [Entry(variant.label, seed, find(variant, seed).id) for variant, seed in entries]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found) if sweep.table != 10 else (), ())
 
-    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", plan)
+    replace_planning(monkeypatch, plan)
+
+
+def replace_planning(monkeypatch: pytest.MonkeyPatch, plan: Callable[..., Plan]) -> None:
+    for module in ("sweep", "table"):
+        monkeypatch.setattr(f"memmlp.cli.{module}.make_plan", plan)
 
 
 def find_trained(home: Path) -> Run:

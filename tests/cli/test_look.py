@@ -81,7 +81,10 @@ def test_bad_input_is_one_line(memmlp: Memmlp, finished: Run, monkeypatch: pytes
                     patch.setattr(f"memmlp.config.open_run.{name}", Mock(side_effect=AssertionError))
             assert one_line(memmlp(command, finished.id, *options), *words), line
     assert not Path("a.png").exists()
-    for place, *options, word in ((finished.onnx, "--clip", "walk", "npz"), ("no.onnx", "no.onnx: ")):
+    for place, *options, word in (
+        (finished.preferred_onnx, "--clip", "walk", "npz"),
+        ("no.onnx", "no.onnx: "),
+    ):
         assert one_line(memmlp("live", str(place), "--no-browser", *options), word)
 
 

@@ -62,7 +62,7 @@ def export(*_: object) -> None:
 
 @pytest.mark.parametrize("fail", [export, click.Abort])  # the latter at a question
 def test_every_interruption_is_one_and_only_what_is_resumed_says_so(memmlp: Memmlp, monkeypatch, fail):
-    monkeypatch.setattr("memmlp.runs.lookup.list_runs", Mock(side_effect=fail))
+    monkeypatch.setattr("memmlp.cli.runs.listing.lookup.list_runs", Mock(side_effect=fail))
     ran = memmlp("runs", "list")
     assert (ran.code, ran.err.strip()) == (130, "memmlp: interrupted")
 

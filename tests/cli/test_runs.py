@@ -87,7 +87,7 @@ def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):
     assert one_line(memmlp("runs", "list", "--where", "memry.layers=2"), "memory.layers")
     assert one_line(memmlp("runs", "list", "--sort", "sed"), "--sort", "did you mean seed")
     assert one_line(memmlp("runs", "list", "--columns", "seed,sed"), "--columns")
-    assert one_line(memmlp("runs", "list", "--where", "seed="), "expected a value")
+    assert one_line(memmlp("runs", "list", "--where", "seed="), "expected a comparison")
 
 
 @pytest.mark.parametrize(("sort", "order"), [("stream.MPJPE", [B, A, C]), ("-stream.MPJPE", [A, B, C])])

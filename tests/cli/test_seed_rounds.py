@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from cli.conftest import replace_planning
 from conftest import Memmlp, one_line
 from fake_runs import fake_run
 
@@ -36,7 +37,7 @@ class Runs:
     def _id(self, label: str, seed: int) -> str:
         return hashlib.sha256(f"{label}{self.version} {seed}".encode()).hexdigest()[:16]
 
-    def work(self, sweep: Sweep, plan: Plan, **settings: object) -> None:
+    def work(self, sweep: Sweep, plan: Plan, workers: object) -> None:
         for entry in plan.entries:
             if any(entry.id == task.id for task in plan.list_remaining()):
                 self.make(entry)
@@ -59,7 +60,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     monkeypatch.chdir(tmp_path)
     write(VARIANTS)
     found = Runs(tmp_path / "outputs")
-    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", found.planned)
+    replace_planning(monkeypatch, found.planned)
     monkeypatch.setattr("memmlp.cli.sweep.run_workers", found.work)
     return found
 

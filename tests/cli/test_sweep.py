@@ -132,7 +132,7 @@ def test_again_does_networks_again_and_force_is_refused(home: Path, tmp_path: Pa
     copy = Path(shutil.copytree(home, tmp_path / "copy"))
     left = []
     monkeypatch.setattr(
-        "memmlp.cli.sweep.run_workers", lambda chosen, plan, **options: left.extend(plan.list_remaining())
+        "memmlp.cli.sweep.run_workers", lambda chosen, plan, workers: left.extend(plan.list_remaining())
     )
     command(copy, "--again")
     assert sorted(task.kind for task in left) == ["memmlp", "memmlp", "memmlp"]

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from cli.conftest import replace_planning
 from conftest import Memmlp, one_line
 
 from memmlp.sweep.plan import Plan
@@ -41,7 +42,7 @@ def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, 
 
 def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("memmlp.common.progress.INTERVAL", 0.0)
-    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", lambda *_: Plan("", Path(), (), ()))
+    replace_planning(monkeypatch, lambda *_: Plan("", Path(), (), ()))
     ran = memmlp("table", "all", "--format", "json")
     assert len(json.loads(ran.out)) == 17
     assert "tables: 1 of 17" in ran.err

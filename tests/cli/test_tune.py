@@ -42,7 +42,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def view(home: Path) -> Study | None:
-    setup = prepare_search([*TINY, *TRIALS], None, home / "outputs")
+    setup = prepare_search([*TINY, *TRIALS], home / "outputs")
     return Study.view(setup.search, setup.folder.name, setup.folder)
 
 
@@ -120,7 +120,7 @@ def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path, mon
     monkeypatch.setattr(Range, "list_corners", lambda self: ())  # which are checked above, and name nothing
 
     def folder(*words: str) -> str:
-        return prepare_search([*TINY, *words], None, tmp_path).folder.name
+        return prepare_search([*TINY, *words], tmp_path).folder.name
 
     base = folder()
     assert folder("search.n_trials=99", "optim.checkpoint_every=7", "search.seeds=1") == base
@@ -138,7 +138,7 @@ def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytes
     command(tmp_path, "data", "synth", "--out", "mine", "--minutes", "2")
     monkeypatch.chdir(tmp_path)
     own = [word for word in TINY if "synth" not in word]
-    setup = prepare_search([*own, "data=mocap", "data.root=mine"], None, tmp_path / "outputs")
+    setup = prepare_search([*own, "data=mocap", "data.root=mine"], tmp_path / "outputs")
     study = Study.open(setup.search, "mine", tmp_path)
 
     def replaced(director: Director, *_: object) -> None:

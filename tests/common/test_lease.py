@@ -88,15 +88,16 @@ def test_this_process_is_alive_and_an_earlier_one_with_its_number_is_not(monkeyp
     assert is_alive(here) is None
 
 
-def test_another_process_waits_and_says_for_whom(tmp_path: Path):
+def test_another_process_waits_and_says_for_whom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     said: list[str] = []
     with holding(tmp_path) as (holder, _):
 
-        def waiting(line: str) -> None:
+        def waiting(line: str, **options: object) -> None:
             said.append(line)
             holder.stdin.close()  # only now it lets go
 
-        with Lock(tmp_path).hold(waiting):
+        monkeypatch.setattr(lease, "print", waiting, raising=False)
+        with Lock(tmp_path).hold():
             assert len(said) == 1
     assert f"process {holder.pid} since" in said[0]
 

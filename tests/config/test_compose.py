@@ -137,7 +137,6 @@ def test_a_bad_command_line_is_one_line(memmlp: Memmlp, tmp_path: Path, monkeypa
 HIDDEN = {
     "--config-dir": ["train", "--config-dir", "mine", "optim.lr=-1"],
     "--cfg": ["train", "--config-dir", "mine", "--cfg", "job"],
-    "hydra.searchpath": ["train", "hydra.searchpath=[file://mine]", "optim.lr=-1"],
     "sweep": ["sweep", "s.yaml", "--config-dir", "mine", "optim.lr=-1"],
 }
 
@@ -211,12 +210,3 @@ def test_a_job_is_composed_as_hydra_composes_it(overrides):
             assert own == compose("train", list(overrides))
         assert OmegaConf.is_struct(own)
         own.model.frames, own.seed = 99, 99
-
-
-def test_hydra_composes_once_for_all_components(monkeypatch: pytest.MonkeyPatch):
-    composed: list[list[str]] = []
-    noted = lambda name, options: composed.append(options) or compose(name, options)  # noqa: E731
-    monkeypatch.setattr("memmlp.config.compose.compose", noted)
-    for options in (["model=rpm"], ["model=recurrent_poser", "optim=adamw"], ["memory=gru", "hand=off"]):
-        compose_config([*options, "loggers=all", "profile=paper"])
-    assert composed == [["loggers=all", "profile=paper", "~model"]]

@@ -6,7 +6,7 @@ import pytest
 
 from memmlp.common.files import write_json
 from memmlp.common.lease import current_process
-from memmlp.runs.garbage_runs import delete, find_garbage
+from memmlp.runs.garbage_runs import delete_garbage, find_garbage
 from memmlp.runs.lookup import add_tags, remove_tags
 from memmlp.runs.run import Run
 
@@ -60,10 +60,10 @@ def test_deleted_is_the_folder_and_no_other_unless_it_was_marked_meanwhile(outpu
     (one,) = find_garbage(outputs, ["failed"])
     assert one.size > 0
     add_tags(one.run, ["keep"])
-    assert not delete(one)
+    assert not delete_garbage(one)
     assert {path.name for path in (outputs / "runs").iterdir()} == before
     remove_tags(one.run, ["keep"])
-    assert delete(one)
+    assert delete_garbage(one)
     assert {path.name for path in (outputs / "runs").iterdir()} == before - {FAILED}
 
 

@@ -32,12 +32,12 @@ def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):
     run = begun(tmp_path)
     assert lookup.read_notes(run) == lookup.Notes()
     lookup.add_tags(run, ["good", "a/b"])
-    lookup.set_note(run, " a note ")
+    lookup.edit_notes(run, note=" a note ")
     lookup.add_tags(run, ["good"])
     run.reset()
     assert lookup.read_notes(run) == lookup.Notes(("a/b", "good"), "a note")
     assert lookup.remove_tags(run, ["good"]) == lookup.Notes(("a/b",), "a note")
-    assert lookup.set_note(run, "") == lookup.Notes(("a/b",), "")
+    assert lookup.edit_notes(run, note="") == lookup.Notes(("a/b",), "")
 
 
 def test_a_damaged_file_says_nothing(tmp_path: Path):

@@ -50,12 +50,12 @@ def test_what_a_run_does_not_have_is_neither_smaller_nor_larger():
 
 
 WRONG = [
-    ("", "expected a key"), ("memory", "a comparison after memory"), ("memory=", "a value after memory="),
-    ("memory=gru or or seed=1", "expected a key, but found 'or'"),
-    ("memory gru", "after memory, but found 'gru'"),
+    ("", "a comparison, but found the end"), ("memory", "a comparison"), ("memory=", "a comparison"),
+    ("memory=gru or or seed=1", "a comparison, but found 'or seed=1'"),
+    ("memory gru", "but found 'memory gru'"), ("seed=1 and", "but found the end"),
     ("status=running", "training, evaluating"), ("seed<many", "expected a number"),
-    ("seed=<", "but found '<'"), ('note="open', "cannot be parsed"),
-    ("memory=gru seed=1", "but found 'seed'"),
+    ("seed=<", "but found 'seed=<'"), ('note="open', "expected a comparison"),
+    ("memory=gru seed=1", "but found 'seed=1'"), ("or=1", "a comparison"),
 ]  # fmt: skip
 
 

@@ -130,7 +130,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment.config["paths"]["outputs"] = str(folder)
     data = experiment.motion.prepare()
     identity = experiment.identity(data.digest)
-    codes = make_prerequisites(replace(experiment, loggers=Loggers((), folder)), data).model
+    codes = make_prerequisites(replace(experiment, loggers=Loggers()), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     experiment.training.train(TrainingJob(experiment.architecture, data, codes, run, experiment.device))

@@ -73,7 +73,7 @@ def test_a_run_leaves_everything(home):
     assert report["component_versions"] == {name: VERSIONS[name] for name in ("metrics", "mode.stream")}
     versions = run.manifest["component_versions"] | report["component_versions"]
     assert load_measured_run(run.folder).origin.component_versions.items() >= versions.items()
-    graph = onnx.load(run.onnx)
+    graph = onnx.load(run.preferred_onnx)
     assert {p.key: p.value for p in graph.metadata_props}["run_id"] == run.id
     out = (home / "out.txt").read_text()
     assert "MPJPE" in out
@@ -119,7 +119,9 @@ def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home, monkeypa
     assert "evaluation done" in command(home, "eval", run.id, *ik)
     assert "finished already" in command(home, "train", *TINY, INT8, *ik)
     with monkeypatch.context() as patch:  # the same graph as that of int8
-        patch.setattr("memmlp.deploy.export.export", lambda model, path, *_: shutil.copy(run.onnx, path))
+        patch.setattr(
+            "memmlp.deploy.export.export", lambda model, path, *_: shutil.copy(run.preferred_onnx, path)
+        )
         said = command(home, "eval", run.id, "export.precision=fp32")
     assert "deployment done" in said
     assert "evaluation" not in said
@@ -168,7 +170,7 @@ def test_changed_weights_are_not_evaluated_and_what_is_exported_is_checked_on_th
 ])  # fmt: skip
 def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(tmp_path, error, failure):
     run = begun(tmp_path)
-    experiment: Any = SimpleNamespace(loggers=Loggers((), tmp_path), stage_ids=(), outputs=tmp_path)
+    experiment: Any = SimpleNamespace(loggers=Loggers(), stage_ids=(), outputs=tmp_path)
     if type(error) is RuntimeError:
         error.__context__ = KeyboardInterrupt()
     with pytest.raises(type(error)), record_outcome(experiment, run):

@@ -8,6 +8,7 @@ from memmlp.cli.data.importing import import_, skeleton, verify
 from memmlp.cli.data.printing import show_exported, show_manifest, show_pairs, show_rates, show_skipped
 from memmlp.cli.options import PATH, FiniteFloat, body_option, format_option, strict_option
 from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write
 
 
 @click.group("data")
@@ -49,7 +50,6 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
 
     SOURCE is an npz file or a folder of npz files. The clips are evenly spaced in the sorted list of files.
     """
-    from memmlp.common.files import atomic_write
     from memmlp.report.pictures.clip_pictures import check_picture_path
     from memmlp.report.pictures.drawing import encode_png
     from memmlp.report.pictures.import_pictures import draw_sheet, read_sample

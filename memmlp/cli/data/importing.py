@@ -10,6 +10,7 @@ from memmlp.cli.data.printing import describe_amount, show_skipped, show_some
 from memmlp.cli.options import PATH, body_option, strict_option
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import join_command, make_override
+from memmlp.config.plugins import choose_grouping
 
 skeleton_option = click.option(
     "--skeleton",
@@ -57,7 +58,6 @@ def import_(
     SOURCE is a folder or one file. Each clip is converted to the 22-joint tree and compared with its file.
     The command reports faults.
     """
-    from memmlp.config.plugins import choose_grouping
     from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
     settings = ImportSettings(skeleton, _parse_rates(fps), body, _parse_floor(floor), strict, sound, up)

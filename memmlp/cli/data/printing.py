@@ -27,7 +27,6 @@ MAX_NAMES = 8  # maximum number of skipped files to print; the manifest lists al
 
 
 def show_manifest(manifest: Manifest) -> None:
-    """Print the split, frame rates and skipped files of a cache, and warnings about its split."""
     from memmlp.motion.preparing.manifest import find_copies  # numpy is slow to import
 
     table = Table("part")
@@ -62,7 +61,6 @@ def show_manifest(manifest: Manifest) -> None:
 
 
 def show_persons(manifest: Manifest) -> None:
-    """Print each person's part, clips and minutes."""
     clips: dict[tuple[str, str], list[int]] = defaultdict(list)
     for clip in manifest.clips:
         clips[clip.split, clip.group].append(clip.length)
@@ -75,26 +73,22 @@ def show_persons(manifest: Manifest) -> None:
 
 
 def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:
-    """Print the frame rates of clips and their conversions to 60 Hz, with the interpolation if given."""
     for (fps, method), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
         detail = f" by {interpolation}" if interpolation and method == INTERPOLATED else ""
         click.echo(f"{count} clips at {fps:g} Hz: {method}{detail}")
 
 
 def show_pairs(label: str, pairs: Mapping[str, str], sign: str = " = ") -> None:
-    """Print the first few pairs of names, and the number of further pairs."""
     show_some(
         [f"{label}: {escape_line_breaks(a)}{sign}{escape_line_breaks(b)}" for a, b in pairs.items()], label
     )
 
 
 def show_skipped(skipped: Sequence[SkippedFile]) -> None:
-    """Print the first few skipped files, and the number of further files."""
     show_some([f"skipped {file.file}: {file.reason}" for file in skipped], "skipped")
 
 
 def show_some(lines: list[str], label: str) -> None:
-    """Print the first few lines, and the number of further ones."""
     for line in lines[:MAX_NAMES]:
         click.echo(line)
     if len(lines) > MAX_NAMES:
@@ -102,13 +96,11 @@ def show_some(lines: list[str], label: str) -> None:
 
 
 def show_exported(report: ExportReport, out: Path) -> None:
-    """Print the skipped and unusual clips of an export, and the number and length of the written clips."""
     show_skipped(report.skipped)
     show_pairs("unusual", report.unusual, ": ")
     click.echo(f"{describe_amount(len(report.written), report.seconds)}, in {out}")
 
 
 def describe_amount(clips: int, seconds: float) -> str:
-    """Describe a number of clips and their total length."""
     length = f"{seconds / 60:.1f} minutes" if seconds >= 60 else f"{seconds:.1f} seconds"
     return f"{clips} clip{'s' * (clips != 1)}, {length}"

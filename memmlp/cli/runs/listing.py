@@ -1,13 +1,12 @@
 """`memmlp runs list`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+from rich.cells import cell_len
 from rich.table import Table
 
 from memmlp.cli.options import outputs_option
@@ -21,12 +20,11 @@ from memmlp.cli.runs.show import (
 )
 from memmlp.common.text_formats import make_console
 from memmlp.evaluation.metric_facts import UNITS
+from memmlp.runs import lookup
 from memmlp.runs.identity import NETWORK
-from memmlp.runs.lookup import describe_kind
-
-if TYPE_CHECKING:
-    from memmlp.runs.query import Record
-    from memmlp.runs.run import Run
+from memmlp.runs.lookup import count_training_frames, describe_kind, warn_if_hardly_trained
+from memmlp.runs.query import Record, check_key, label_data, list_differing_keys, parse_query
+from memmlp.runs.run import Run
 
 MAX_RUNS = 20
 RESULT_COLUMNS = {
@@ -65,9 +63,6 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     `window.position.Jitter`, `latency.median_ms`), or `id`, `kind`, `status`, `name`, `data`, `started`,
     `tag`, `note`.
     """
-    from memmlp.runs import lookup
-    from memmlp.runs.query import parse_query
-
     query = parse_query(where) if where else None
     runs = [run for run in lookup.list_runs(outputs) if every or query or not lookup.read_notes(run).archived]
     if not runs:
@@ -122,9 +117,6 @@ def _describe_outdated_results(listed: Sequence[Run]) -> list[str]:
 
 
 def _describe_hardly_trained(listed: Sequence[Run]) -> list[str]:
-    """Return a line with the finished runs that had too little training; no line without such runs."""
-    from memmlp.runs.lookup import count_training_frames, warn_if_hardly_trained
-
     networks = [run for run in listed if run.manifest.get("kind") == NETWORK and run.done]
     ids = [run.id[:ID_LENGTH] for run in networks if warn_if_hardly_trained(count_training_frames(run))]
     if not ids:
@@ -139,14 +131,11 @@ def _join_ids(ids: Sequence[str]) -> str:
 
 
 def _is_finished_part(run: Run) -> bool:
-    """Return whether a run is a finished VQ-VAE or network part, which has no results to list."""
     return run.kind not in (None, NETWORK) and run.done
 
 
 def _sort_runs(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:
     """Return the runs sorted by a key. Runs with a missing or NaN value come last."""
-    from memmlp.runs.query import check_key
-
     key, reverse = sort.removeprefix("-"), sort.startswith("-")
     check_key(key, records.values(), "--sort")
     values: dict[str, Any] = {run.id: records[run.id].get(key) for run in listed}
@@ -158,9 +147,7 @@ def _sort_runs(listed: Sequence[Run], records: Mapping[str, Record], sort: str) 
 
 
 def _choose_keys(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:
-    """Return the keys to show: those of --columns, or config keys that differ between finished runs."""
-    from memmlp.runs.query import check_key, list_differing_keys
-
+    """Return the keys of --columns, or config keys that differ between finished runs."""
     if columns is not None:
         keys = [key.strip() for key in columns.split(",") if key.strip()]
         for key in keys:
@@ -172,37 +159,28 @@ def _choose_keys(columns: str | None, records: Mapping[str, Record], listed: Seq
 
 
 def _print_table(records: Sequence[Record], keys: Sequence[str], keys_requested: bool) -> list[str]:
-    """Print the runs, by their records with `age`, as a table, and return the keys that did not fit. Keys
-    that --columns requested are all shown, without results."""
+    """Print the runs as a table, and return the keys that did not fit. With --columns, all keys are shown."""
     columns = _make_columns(records, keys, keys_requested)
     removable = ["age"] if keys_requested else [*REMOVABLE_COLUMNS, *reversed(keys[:MAX_COLUMNS])]
-    wide = make_console(width=10_000)
     limit = make_console().width
-    widest = {head: _find_widest(cells) for head, cells in columns.items()}  # all cells would take seconds
-    while (width := wide.measure(_make_table(widest, keys_requested)).minimum) > limit and removable:
-        head = removable.pop(0)
-        columns.pop(head, None)
-        widest.pop(head, None)
-    shown = make_console(width=max(limit, width))
-    shown.print(_make_table(columns, keys_requested))
+    while (width := _find_minimum_width(columns, keys_requested)) > limit and removable:
+        columns.pop(removable.pop(0), None)
+    make_console(width=max(limit, width)).print(_make_table(columns, keys_requested))
     return [key for key in keys if key not in columns]
 
 
-def _find_widest(cells: Sequence[str]) -> list[str]:
-    """Return the cells with the widest line and the widest word."""
-    from rich.cells import cell_len
-
-    return [
-        max(cells, key=lambda cell: max(map(cell_len, split(cell)), default=0), default="")
-        for split in (str.splitlines, str.split)
-    ]
+def _find_minimum_width(columns: Mapping[str, Sequence[str]], keys_requested: bool) -> int:
+    """Return the minimum width of a table in characters: that of the widest word in each column."""
+    total = len(columns) - 1
+    for head, cells in columns.items():
+        least = NAME_WIDTH if head == "name" and not keys_requested else 0
+        total += max(least, *(cell_len(word) for cell in (head, *cells) for word in cell.split()))
+    return total
 
 
 def _make_columns(
     records: Sequence[Record], keys: Sequence[str], keys_requested: bool
 ) -> dict[str, list[str]]:
-    from memmlp.runs.query import label_data
-
     columns = {"run": [one["id"] for one in records]}
     columns |= {head: [str(one.get(head) or "-") for one in records] for head in ("status", "age")}
     labels = label_data(records)

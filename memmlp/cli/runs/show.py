@@ -1,12 +1,10 @@
 """`memmlp runs show` and `memmlp runs diff`, and helpers for the other commands of `memmlp runs`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from rich import box
@@ -14,12 +12,14 @@ from rich.table import Table
 
 from memmlp.cli.options import outputs_option
 from memmlp.common.errors import InputError
+from memmlp.common.overrides import flatten
 from memmlp.common.text_formats import make_console
 from memmlp.evaluation.metric_facts import UNITS
-
-if TYPE_CHECKING:
-    from memmlp.runs.query import Record
-    from memmlp.runs.run import Run
+from memmlp.runs.deployment_folder import describe_timing_machine
+from memmlp.runs.evaluation_file import add_solver_names
+from memmlp.runs.lookup import count_training_frames, find_run, is_trained, warn_if_hardly_trained
+from memmlp.runs.query import Record, build_record, format_typed_value, label_data, list_differing_keys
+from memmlp.runs.run import Run
 
 ID_LENGTH = 8  # number of characters of a shortened id
 MAX_VALUE_LENGTH = 36  # maximum number of characters of a value
@@ -43,10 +43,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
 
     RUN is an id, the beginning of an id, or a folder.
     """
-    from memmlp.common.overrides import flatten
     from memmlp.report.tables.measured_run import load_measured_run
-    from memmlp.runs.evaluation_file import add_solver_names
-    from memmlp.runs.lookup import find_run, is_trained
 
     found = find_run(outputs, run)
     make_console().print(_make_pair_table(_summarize_run(found)))
@@ -73,13 +70,9 @@ def _summarize_run(run: Run) -> dict[str, Any]:
     facts["data"] = " ".join(dict.fromkeys([str(values.get("data", "-")), digest]))
     if prerequisite := manifest.get("prerequisite"):
         facts["needs run"] = prerequisite
-    attempts = [
-        f"{one['stage']} from step {one['step']}, {one['started']}"
-        for one in manifest.get("attempts", [])
-        if {"stage", "step", "started"} <= one.keys()
-    ]
-    if attempts:
-        facts["attempts"] = "\n".join(attempts)
+    if attempts := manifest.get("attempts"):
+        lines = (f"{one.get('stage')} from step {one.get('step')}, {one.get('started')}" for one in attempts)
+        facts["attempts"] = "\n".join(lines)
     facts |= list_outdated_results(run)
     if changed := run.verify():
         facts["changed since"] = ", ".join(changed)
@@ -96,8 +89,6 @@ def diff(a: str, b: str, outputs: Path) -> None:
     The command compares config keys that affect results, data, results, code and machine. Changes are B
     minus A.
     """
-    from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
-
     pair = first, second = find_run(outputs, a), find_run(outputs, b)
     ids, short = [run.id for run in pair], [run.id[:ID_LENGTH] for run in pair]
     if rows := _list_config_differences(first, second):
@@ -129,18 +120,14 @@ def _print_rows(table: Table, rows: list[tuple[str, ...]], wrapped: slice) -> No
 
 
 def _list_config_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for each difference of config keys or data that affects results."""
-    from memmlp.runs.query import label_data, list_differing_keys
-
     pair = [read_record(run) for run in (first, second)]
     digests = [str(one.get("data_digest")) for one in pair]
-    keys = list_differing_keys([run.config for run in (first, second)], digests)
+    keys = list_differing_keys([first.config, second.config], digests)
     rows = [(key, *(format_value(one, key) for one in pair)) for key in keys]
     return rows if len(set(digests)) == 1 else [("data", *label_data(pair)), *rows]
 
 
 def list_result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for each measured number that differs: key, both values, change and unit."""
     a, b = collect_measured_numbers(first), collect_measured_numbers(second)
     return [
         (
@@ -156,16 +143,10 @@ def list_result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
 
 
 def _list_origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for each difference in code or machine, which can affect results of equal configs."""
-    from memmlp.common.overrides import flatten
-    from memmlp.runs.deployment_folder import describe_timing_machine
-
     a, b = (
         flatten({key: run.manifest.get(key) for key in ORIGIN_KEYS})
-        | {
-            "latency": describe_timing_machine(run.deployment_as_configured.record),
-            **list_outdated_results(run),
-        }
+        | {"latency": describe_timing_machine(run.deployment_as_configured.record)}
+        | list_outdated_results(run)
         for run in (first, second)
     )
     return [
@@ -177,8 +158,6 @@ def _list_origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
 
 def read_record(run: Run) -> Record:
     """Return a run's record of values. For a run with a damaged file, it has only the id and status."""
-    from memmlp.runs.query import build_record
-
     try:
         return build_record(run)
     except InputError as error:
@@ -188,8 +167,6 @@ def read_record(run: Run) -> Record:
 
 def format_value(record: Record, key: str, whole: bool = False) -> str:
     """Format a record's value; a long text is shortened unless `whole` is set."""
-    from memmlp.runs.query import format_typed_value
-
     text = format_typed_value(record[key]) if key in record else "-"
     return text if whole or len(text) <= MAX_VALUE_LENGTH else f"{text[:MAX_VALUE_LENGTH]}…"
 
@@ -235,7 +212,6 @@ def _format_cell(value: Any) -> str:
 
 
 def format_age(run: Run) -> str:
-    """Return the time since the run started, in its largest whole unit."""
     try:
         started = datetime.fromisoformat(run.manifest.get("started", ""))
         seconds = (datetime.now(UTC) - started).total_seconds()

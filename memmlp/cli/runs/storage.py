@@ -7,6 +7,9 @@ import click
 from memmlp.cli.options import PATH, FiniteFloat, outputs_option
 from memmlp.cli.runs.show import format_age, make_plain_table
 from memmlp.common.text_formats import make_console
+from memmlp.runs.archive import export_run, import_run
+from memmlp.runs.garbage_runs import REASONS, delete_garbage, delete_run, find_garbage, list_dependents
+from memmlp.runs.lookup import add_tags, change_run, edit_notes, find_run, read_notes, remove_tags
 
 
 @click.command("tag")
@@ -20,8 +23,6 @@ def tag(run: str, tags: tuple[str, ...], remove: bool, outputs: Path) -> None:
     Tags are stored in the run's folder and do not change its id. `memmlp runs list --where tag=WORD` lists
     tagged runs, and `memmlp runs gc` does not delete them.
     """
-    from memmlp.runs.lookup import add_tags, find_run, remove_tags
-
     found = find_run(outputs, run)
     notes = remove_tags(found, tags) if remove else add_tags(found, tags)
     click.echo(f"{found.id}: {', '.join(notes.tags) or 'no tags'}")
@@ -36,10 +37,8 @@ def note(run: str, text: str | None, outputs: Path) -> None:
 
     An empty TEXT removes the note.
     """
-    from memmlp.runs.lookup import find_run, read_notes, set_note
-
     found = find_run(outputs, run)
-    notes = read_notes(found) if text is None else set_note(found, text)
+    notes = read_notes(found) if text is None else edit_notes(found, note=text)
     click.echo(f"{found.id}: {notes.note or 'no note'}")
 
 
@@ -48,8 +47,6 @@ def _make_command(action: str, text: str) -> click.Command:
     @click.argument("runs", nargs=-1, required=True)
     @outputs_option
     def command(runs: tuple[str, ...], outputs: Path) -> None:
-        from memmlp.runs.lookup import change_run, find_run
-
         for run in [find_run(outputs, one) for one in runs]:
             change_run(run, action)
             click.echo(f"{run.id}: {run.status}")
@@ -78,8 +75,6 @@ def rename(run: str, name: str, outputs: Path) -> None:
 
     Its id stays. An empty NAME restores the usual name.
     """
-    from memmlp.runs.lookup import change_run, find_run
-
     change_run(find_run(outputs, run), "name", name)
 
 
@@ -89,9 +84,6 @@ def rename(run: str, name: str, outputs: Path) -> None:
 @outputs_option
 def delete(runs: tuple[str, ...], yes: bool, outputs: Path) -> None:
     """Delete runs, or print what depends on them."""
-    from memmlp.runs.garbage_runs import delete_run, list_dependents
-    from memmlp.runs.lookup import find_run
-
     for run in [find_run(outputs, one) for one in runs]:
         lines = list_dependents(outputs, run)
         click.echo(f"{run.id}: {'; '.join(lines) or 'nothing depends on it'}")
@@ -118,8 +110,6 @@ def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
     uses, or a folder without a run. Runs with a tag or a note, runs in progress, and prerequisite runs of
     other runs are kept.
     """
-    from memmlp.runs.garbage_runs import REASONS, delete, find_garbage
-
     garbage = find_garbage(outputs, kinds or REASONS)
     if not garbage:
         click.echo("nothing to delete")
@@ -132,7 +122,7 @@ def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
         size = sum(one.size for one in garbage) / 1e6
         click.echo(f"{len(garbage)} runs, {size:.1f} MB; delete them with --yes")
         return
-    deleted = [one for one in garbage if delete(one)]
+    deleted = [one for one in garbage if delete_garbage(one)]
     click.echo(f"deleted {len(deleted)} runs, {sum(one.size for one in deleted) / 1e6:.1f} MB")
     for one in garbage:
         if one not in deleted:
@@ -148,9 +138,6 @@ def export(run: str, out: Path | None, outputs: Path) -> None:
 
     The file contains the run's config, manifest, weights, results, tags and note, but no checkpoint.
     """
-    from memmlp.runs.archive import export_run
-    from memmlp.runs.lookup import find_run
-
     found = find_run(outputs, run)
     path = out or Path(f"{found.id}.memmlp.zip")
     digest = export_run(found, path)
@@ -174,7 +161,5 @@ def import_(path: Path, sha256: str | None, max_gb: float, outputs: Path) -> Non
     The command rejects a file with a wrong digest inside. --sha256 verifies that the file is the exported
     one. An existing run is not changed, even if the file has additional evaluations or deployments.
     """
-    from memmlp.runs.archive import import_run
-
-    run, new = import_run(path, outputs, sha256, int(max_gb * 1e9), lambda line: click.echo(line, err=True))
+    run, new = import_run(path, outputs, sha256, int(max_gb * 1e9))
     click.echo(f"run {run.id}: {'imported' if new else 'exists already'}")

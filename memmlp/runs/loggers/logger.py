@@ -109,8 +109,8 @@ def read_run_facts(run: Run, running: bool = False) -> RunFacts:
 
 
 class LogReader:
-    """Reads a run's metrics log: first all existing lines, then only new lines. `repeated` is set once a step
-    was logged again, because the run was resumed."""
+    """Reads new lines of a run's metrics log. `repeated` is set once a resumed run has logged a step
+    again."""
 
     def __init__(self, run: Run):
         self.log, self.offset, self.repeated = MetricsLog(run.metrics_path), 0, False
@@ -229,38 +229,27 @@ class Session:
 
 @dataclass(frozen=True)
 class Loggers:
-    loggers: tuple[RunLogger, ...]
-    outputs: Path
+    loggers: tuple[RunLogger, ...] = ()
 
     @contextlib.contextmanager
     def show_run(self, run: Run) -> Iterator[None]:
         """Show a run during the context, then its final state. A logger never stops the run: if it fails, a
         warning goes to stderr; if it is slow, the run waits at its end for at most MAX_WAIT."""
         ended = threading.Event()
-        threads = self._start_threads(
-            lambda logger: _show_until_end(Session(logger, run), ended), f"run {run.id}"
-        )
+        threads: list[threading.Thread] = []
+        for logger in self.loggers:
+            arguments = (Session(logger, run), ended)
+            threads.append(threading.Thread(target=_show_until_end, args=arguments, daemon=True))
+            threads[-1].start()
         try:
             yield
         finally:
             ended.set()
-            _wait_for_threads(threads)
-
-    def _start_threads(self, work: Callable[[RunLogger], object], subject: str) -> list[threading.Thread]:
-        threads = []
-        for one in self.loggers:
-            warning = f"{subject} is not shown in {one.name}"  # `_wait_for_threads` prints it
-            threads.append(threading.Thread(target=work, args=(one,), name=warning, daemon=True))
-            threads[-1].start()
-        return threads
-
-
-def _wait_for_threads(threads: Sequence[threading.Thread]) -> None:
-    end = time.monotonic() + MAX_WAIT
-    for thread in threads:
-        thread.join(max(end - time.monotonic(), 0))
-        if thread.is_alive():
-            _warn(f"{thread.name}: the logger is too slow")
+            latest = time.monotonic() + MAX_WAIT
+            for logger, thread in zip(self.loggers, threads, strict=True):
+                thread.join(max(latest - time.monotonic(), 0))
+                if thread.is_alive():
+                    _warn(f"run {run.id} is not shown in {logger.name}: the logger is too slow")
 
 
 def _show_until_end(session: Session, ended: threading.Event) -> None:

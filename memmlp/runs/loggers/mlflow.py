@@ -6,7 +6,7 @@ import contextlib
 import logging
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from urllib.parse import quote
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings, setting
-from memmlp.common.text_formats import make_key, make_sqlite_url
+from memmlp.common.text_formats import make_key
 from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
 if TYPE_CHECKING:
@@ -30,10 +30,7 @@ ENVIRONMENT = {
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
 EXPERIMENT = "memmlp"
-STATUS = {
-    "running": "RUNNING", "done": "FINISHED", "failed": "FAILED", "killed": "KILLED",
-    "stopped": "KILLED", "interrupted": "KILLED",
-}  # fmt: skip
+STATUS = {"running": "RUNNING", "done": "FINISHED", "failed": "FAILED", "killed": "KILLED"}
 PARAM_LENGTH, TAG_LENGTH, PARAMS, METRICS = 6000, 5000, 100, 1000  # MLflow's limits
 
 
@@ -64,8 +61,8 @@ class MLflow:
     @property
     def place(self) -> str:
         """The URI of MLflow's tracking store."""
-        local = make_sqlite_url(self.outputs.absolute() / "mlflow.db")
-        return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or local
+        local = quote(str(self.outputs.absolute() / "mlflow.db"))
+        return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{local}"
 
     def fingerprint(self, run_id: str) -> str | None:
         """Return the fingerprint that MLflow stores for a finished run; None without one."""
@@ -79,7 +76,10 @@ class MLflow:
 
         with self.client() as (client, experiment):
             tags = {"memmlp.run_id": facts.id} | _build_tags(facts)
-            run_id = _replace_run(client, experiment, "memmlp.run_id", facts.name, tags, facts.started)
+            for old in client.search_runs([experiment], f"tags.`memmlp.run_id` = '{facts.id}'"):
+                client.delete_run(old.info.run_id)
+            start = int(facts.started * 1000)
+            run_id = client.create_run(experiment, start, tags, run_name=facts.name).info.run_id
             params = [Param(_make_key(key), value[:PARAM_LENGTH]) for key, value in facts.config.items()]
             for batch in _split_into_batches(params, PARAMS):
                 client.log_batch(run_id, params=batch)
@@ -102,18 +102,12 @@ class MLflow:
             logging.getLogger(package).setLevel(logging.CRITICAL)
         self.outputs.mkdir(parents=True, exist_ok=True)
         local = self.place.startswith("sqlite:")
-        if self.place == make_sqlite_url(database := self.outputs.absolute() / "mlflow.db"):
-            database.touch()  # with the modes of other files; SQLite's own are 0644
         with FileLock(self.outputs / ".mlflow.lock") if local else contextlib.nullcontext():
             client = MlflowClient(tracking_uri=self.place)
             if client.get_experiment_by_name(EXPERIMENT) is None:
                 artifacts = (self.outputs.absolute() / "mlflow-artifacts").as_uri() if local else None
                 with contextlib.suppress(MlflowException):  # another process has created it meanwhile
                     client.create_experiment(EXPERIMENT, artifact_location=artifacts)
-            with contextlib.suppress(OSError):  # MLflow makes an empty folder with the URL's escapes
-                stray = Path(quote(str(self.outputs.absolute())))
-                if stray != self.outputs.absolute():
-                    os.removedirs(stray)
             experiment = client.get_experiment_by_name(EXPERIMENT)
             assert experiment is not None
             if experiment.lifecycle_stage == "deleted":
@@ -127,7 +121,6 @@ class ShownInMLflow:
     mlflow_id: str
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Send points in batches."""
         with self.logger.client() as (client, _):
             _send_points(client, self.mlflow_id, points)
 
@@ -146,17 +139,6 @@ class ShownInMLflow:
 
     def close(self) -> None:
         """Do nothing: MLflow does not keep runs open."""
-
-
-def _replace_run(
-    client: MlflowClient, experiment: str, key: str, name: str, tags: Mapping[str, str], start: float | None
-) -> str:
-    """Create an MLflow run, delete older runs with the same value of tag `key`, and return its MLflow id."""
-    value = tags[key].replace("'", "\\'")
-    for old in client.search_runs([experiment], f"tags.`{key}` = '{value}'"):
-        client.delete_run(old.info.run_id)
-    start_ms = None if start is None else int(start * 1000)
-    return client.create_run(experiment, start_ms, dict(tags), run_name=name).info.run_id
 
 
 def _send_points(client: MlflowClient, mlflow_id: str, points: Sequence[CurvePoint]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,8 +27,7 @@ class TensorBoardSettings(Settings):
 
 @dataclass(frozen=True)
 class TensorBoard:
-    """Writes each run as a folder of event files in outputs/tensorboard. Raises InputError without
-    tensorboardX."""
+    """Writes each run as a folder of event files in outputs/tensorboard."""
 
     outputs: Path
 
@@ -40,7 +38,6 @@ class TensorBoard:
 
     @property
     def place(self) -> str:
-        """The folder to pass to `tensorboard --logdir`."""
         return str(self.outputs.absolute() / "tensorboard")
 
     def fingerprint(self, run_id: str) -> str | None:
@@ -64,20 +61,12 @@ class ShownInTensorBoard:
     """A run with an open event file."""
 
     def __init__(self, folder: Path):
-        hides_torch = "torch" not in sys.modules
-        if hides_torch:  # tensorboardX would import it for graphs, which takes 2 s and 200 MB
-            sys.modules["torch"] = None  # type: ignore[assignment]
-        try:
-            from tensorboardX import SummaryWriter
-        finally:
-            if hides_torch:
-                del sys.modules["torch"]
+        from tensorboardX import SummaryWriter
 
         # flush() alone is not enough, since the writer's thread has a queue; the default is 120 s
         self.folder, self.writer = folder, SummaryWriter(str(folder), flush_secs=1)
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Write points to disk."""
         for point in points:
             self.writer.add_scalar(
                 make_key(point.key, r"a-zA-Z0-9_./-", 500), point.value, point.step, walltime=point.time
@@ -95,12 +84,10 @@ class ShownInTensorBoard:
         (self.folder / FINGERPRINT).write_text(facts.fingerprint)
 
     def close(self) -> None:
-        """Close the file."""
         self.writer.close()
 
 
-def _make_folder_name(name: str, run_id: str = "") -> str:
-    """Return the folder name that TensorBoard shows for a run: its name and the first digits of its id."""
-    ending = f" · {run_id[:8]}" if run_id else ""
+def _make_folder_name(name: str, run_id: str) -> str:
+    ending = f" · {run_id[:8]}"
     safe = re.sub(r"[^\w=.,·+() -]", "_", name)[: MAX_NAME - len(ending)]
     return safe.encode()[: MAX_BYTES - len(ending.encode())].decode(errors="ignore") + ending

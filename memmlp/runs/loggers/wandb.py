@@ -32,8 +32,7 @@ class WandBSettings(Settings):
 
 @dataclass(frozen=True)
 class WandB:
-    """Writes runs as W&B offline runs to outputs/wandb; `wandb sync` uploads them to the W&B project
-    `project`. Raises InputError if wandb is not installed."""
+    """Writes runs as W&B offline runs to outputs/wandb; `wandb sync` uploads them to `project`."""
 
     project: str
     outputs: Path
@@ -45,7 +44,6 @@ class WandB:
 
     @property
     def place(self) -> str:
-        """The folder with the offline runs."""
         return str(self.outputs.absolute() / "wandb")
 
     def fingerprint(self, run_id: str) -> str | None:
@@ -55,20 +53,12 @@ class WandB:
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInWandB:
         """Start a new offline run, and remove older ones of the same run."""
-        config = {**facts.config, "run": {**facts.origin, "folder": str(facts.folder)}}
-        run = self._start_offline_run(
-            facts.id, facts.name, tags=list(facts.tags), notes=facts.note or None, config=config
-        )
-        shown = ShownInWandB(run, self._find_folders(facts.id)[0])
-        shown.log(points)
-        return shown
-
-    def _start_offline_run(self, run_id: str, name: str, **options: Any) -> Any:
+        origin = {**facts.origin, "folder": str(facts.folder)}
         os.environ.update(OFFLINE)
         import wandb
 
-        stamps = {old.name.split("-")[2] for old in self._find_folders(run_id)}
-        for old in self._find_folders(run_id):
+        stamps = {old.name.split("-")[2] for old in self._find_folders(facts.id)}
+        for old in self._find_folders(facts.id):
             shutil.rmtree(old)
         while time.strftime("%Y%m%d_%H%M%S") in stamps:  # wandb would leave a folder with the same name empty
             time.sleep(0.05)
@@ -77,10 +67,14 @@ class WandB:
             console="off", silent=True, x_disable_stats=True, x_disable_meta=True,
             disable_git=True, disable_code=True, disable_job_creation=True,
         )  # fmt: skip
-        return wandb.init(
-            project=self.project, id=run_id, name=name, dir=str(self.outputs.absolute()),
-            mode="offline", settings=settings, reinit="create_new", **options,
+        run = wandb.init(
+            project=self.project, id=facts.id, name=facts.name, dir=str(self.outputs.absolute()),
+            mode="offline", settings=settings, reinit="create_new", tags=list(facts.tags),
+            notes=facts.note or None, config={**facts.config, "run": origin},
         )  # fmt: skip
+        shown = ShownInWandB(run, self._find_folders(facts.id)[0])
+        shown.log(points)
+        return shown
 
     def _find_folders(self, run_id: str) -> list[Path]:
         return list(Path(self.place).glob(f"offline-run-*-{run_id}"))

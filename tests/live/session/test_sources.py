@@ -17,7 +17,7 @@ from live.session.conftest import PERSON
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import send_announcements_to
+from memmlp.common.progress import print_announcements
 from memmlp.live.outputs import encode_osc
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.session.sources import (
@@ -217,14 +217,13 @@ def test_only_this_machine_is_listened_to():
     PacketSource("UDP", arrives.port, parse_json_packet, "amass").close()
 
 
-def test_an_unusual_file_is_reported_and_a_short_one_rejected(tmp_path: Path):
+def test_an_unusual_file_is_reported_and_a_short_one_rejected(tmp_path: Path, capsys):
     """Somebody who lies throughout, or a file with another axis up."""
     turns = 1e-3 * np.arange(5.0)[:, None, None] + np.zeros((5, 22, 3))
     write_clip(tmp_path / "a.npz", Clip("a", turns, np.zeros((5, 3)), 60.0))
     write_clip(tmp_path / "b.npz", Clip("b", turns[:2], np.zeros((2, 3)), 60.0))
-    said: list[str] = []
-    with send_announcements_to(said.append):
+    with print_announcements():
         assert len(read_npz_frames(tmp_path / "a.npz", make_builtin_rest_joints())) == 4
         with pytest.raises(InputError, match=r"b\.npz: has 2 frames"):
             read_npz_frames(tmp_path / "b.npz", make_builtin_rest_joints())
-    assert said[0].startswith(f"{tmp_path / 'a.npz'}: is unusual")
+    assert capsys.readouterr().err.startswith(f"{tmp_path / 'a.npz'}: is unusual")

@@ -12,7 +12,7 @@ import pytest
 from chromium import Browser
 from live.web.conftest import PERSON, REMARK, Made, package_files
 
-from memmlp.common.npm import IWER
+from memmlp.common.npm import Package
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Offsets
@@ -21,6 +21,11 @@ from memmlp.live.web.site import NUMBERS, pack_clip
 pytestmark = pytest.mark.long
 
 HEADSET = Path(__file__).with_name("headset.js")
+IWER = Package(  # a headset in software
+    "iwer",
+    "2.5.0",
+    "sha512-grq7iMyWo4s2DYnATKLPPoAByhcNuwLjMHHOILrFU9q8EGHIEzHyUuq1mz+9Xqy6+xrYPn3Ho8Z9eymZCE+D6w==",
+)
 SITE = "document.documentElement.dataset"
 TAPE = """import('./stream.js').then(({ Stream }) => {
   window.tape = [];

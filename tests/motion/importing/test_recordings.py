@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from bvh_samples import person, refuse, write
 
-from memmlp.common.progress import send_announcements_to
+from memmlp.common.progress import print_announcements
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.recordings import DIGITS, find_rate, find_recordings, read_recording
 
@@ -64,7 +64,7 @@ def test_other_files_are_passed_over(tmp_path: Path) -> None:
     assert len(read_recording(tmp_path / "all" / "deep" / "A.BVH")) == 3
 
 
-def test_linked_folders_are_searched_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_linked_folders_are_searched_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """A folder of links to data sets, one of which leads back."""
     write(tmp_path / "cmu", person("cmu_daz", 3, 0).text(), "05/a.bvh")
     (tmp_path / "sets").mkdir()
@@ -72,11 +72,11 @@ def test_linked_folders_are_searched_once(tmp_path: Path, monkeypatch: pytest.Mo
         (tmp_path / "sets" / name).symlink_to(tmp_path / "cmu")
     (tmp_path / "cmu" / "back").symlink_to(tmp_path / "sets")
     assert find_recordings(tmp_path / "sets") == {Path("one/05/a.bvh"): tmp_path / "sets/one/05/a.bvh"}
-    lines: list[str] = []
     scan = os.scandir
     monkeypatch.setattr(os, "scandir", lambda path: scan(tmp_path / "none" if "two" in str(path) else path))
     (tmp_path / "sets/two").unlink()
     (tmp_path / "sets/two").mkdir()
-    with send_announcements_to(lines.append):
+    with print_announcements():
         find_recordings(tmp_path / "sets")
-    assert lines == [f"{tmp_path}/sets/two: cannot be listed (No such file or directory)"]
+    line = f"{tmp_path}/sets/two: cannot be listed (No such file or directory)"
+    assert capsys.readouterr().err == f"{line}\n"

@@ -9,7 +9,7 @@ from processes import until
 
 from memmlp.runs.loggers.logger import Session, sync_runs
 from memmlp.runs.loggers.tensorboard import TensorBoard
-from memmlp.runs.lookup import set_note
+from memmlp.runs.lookup import edit_notes
 
 pytest.importorskip("tensorboardX")
 
@@ -68,7 +68,7 @@ def test_runs_with_long_names_have_a_folder_each(tmp_path: Path):
 def test_it_tells_how_a_run_ended_and_what_people_said(tmp_path: Path):
     logger, run = TensorBoard(tmp_path), a_run(tmp_path)
     run.fail("loss is nan")
-    set_note(run, "a note")
+    edit_notes(run, note="a note")
     an_outdated_evaluation(run)
     sync_runs(logger, [run], print)
     (folder,) = Path(logger.place).iterdir()
