@@ -12,11 +12,12 @@ import click
 import pytest
 import yaml
 from conftest import long_except
+from omegaconf import OmegaConf
 from own_package import PACKAGE, registers_kept
 
 from memmlp.cli.main import commands
 from memmlp.cli.workers import Workers, split_executor
-from memmlp.config.build import build_untrained
+from memmlp.config.build import build_untrained, make_readable_name
 from memmlp.config.compose import compose_config, compose_jobs, compose_plain, parse_hydra_arguments
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.plugins import activate
@@ -267,6 +268,9 @@ def test_examples_of_the_guides_work(tmp_path: Path, monkeypatch: pytest.MonkeyP
         words = ["plugins=[mine]", "profile=tiny", "--config-dir", str(tmp_path / "myconf")]
         cfg = compose_config([*words, "model=wide_conv"])
         assert (cfg.model.name, cfg.model.width, cfg.loss.name) == ("causal_conv", 512, "terms")
+        assert make_readable_name("memmlp", OmegaConf.to_container(cfg, resolve=True)).startswith(
+            "profile=tiny · model=causal_conv"
+        )
         assert "mine" not in sys.modules
         names: dict[str, Any] = {}
         exec(test, names)

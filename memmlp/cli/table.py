@@ -179,6 +179,10 @@ def gather_tables(
     sweeps = find_sweeps(name, overrides)
     for sweep, command in progress_bar(sweeps, "tables") if len(sweeps) > 1 else sweeps:
         sweep = sweep.with_branch(selection.branch) if selection.branch else sweep
+        if selection.untrained:
+            from memmlp.config.untrained_costs import check_costs
+
+            check_costs(sweep)
         try:
             shown = load_shown_sweep(sweep, overrides, outputs.absolute())
             tables.append(make_plan_table(shown, modes, command, read, selection))
@@ -186,7 +190,7 @@ def gather_tables(
             failures.append(error)
             table = make_empty_table(sweep, modes, f"nothing measured: {error}")
             tables.append(SweepTable(sweep, {variant.label: {} for variant in sweep.list_runnable()}, table))
-    chosen = overrides or selection.source or selection.together or selection.untrained
+    chosen = overrides or selection.source or selection.together
     if failures and len(failures) == len(tables) and (chosen or tables[0].sweep.table is None):
         raise failures[0]
     return tables

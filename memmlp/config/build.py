@@ -333,7 +333,11 @@ def _list_differences(config: Mapping[str, Any]) -> Iterator[str]:
         slots = [slot for slot in options if (slot == "model") == is_model]
         changed = [slot for slot in slots if options[slot] != find_option(default, slot)]
         yield from (f"{slot}={options[slot] or 'none'}" for slot in changed)
-        chosen += [f"{slot}={options[slot] or 'null'}" for slot in changed if slot not in custom]
+        chosen += [
+            f"{slot}={options[slot]}" if options[slot] else f"~{slot}"
+            for slot in changed
+            if slot not in custom
+        ]
     default = _compose_default(tuple(chosen))
     own, usual = flatten(config), {"data.drawn_by": "frames", "data.mirror": False} | flatten(default)
     counting = select_training_config(config) | select_training_config(default)  # a key may count in one only

@@ -64,6 +64,8 @@ def parse_hydra_arguments(argv: Sequence[str]) -> argparse.Namespace:
     if sum(map(bool, (args.run, args.multirun, args.cfg, args.info, args.shell_completion))) > 1:
         _raise_input_error("--run, --multirun, --cfg, --info, --shell-completion: expected only one of them")
     args.overrides = list(map(keep_text, args.overrides))
+    if any(one.lstrip("+").startswith("hydra.searchpath") for one in args.overrides):
+        raise InputError("hydra.searchpath: use --config-dir")  # whose files are checked
     for name in ("config_dir", "config_path"):
         if folder := getattr(args, name):
             setattr(args, name, os.path.expanduser(folder))

@@ -20,12 +20,8 @@ def measure_untrained_variants(
 ) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
     """Measure an untrained network for each variant of a sweep without a finished run; times only if the
     sweep shows one. Return all runs by variant and seed, and flags that name these variants. Raises
-    InputError if the sweep's metrics include errors."""
-    if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
-        raise InputError(
-            f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}; "
-            f"expected only metrics from {', '.join(COSTS)}"
-        )
+    InputError if the sweep's metrics include errors (`check_costs`)."""
+    check_costs(sweep)
     timed = not set(sweep.metrics) <= set(SIZES)
     without = [variant for variant in sweep.list_runnable() if not runs[variant.label]]
     costs: dict[str, RunsBySeed] = {}
@@ -39,6 +35,13 @@ def measure_untrained_variants(
     names = ", ".join(f"'{label}'" for label in costs)
     flags = (f"networks that were not trained, with random weights: {names}",) if costs else ()
     return {label: dict(costs.get(label, found)) for label, found in runs.items()}, flags
+
+
+def check_costs(sweep: Sweep) -> None:
+    """Raise InputError if a sweep's metrics include errors, which need trained networks."""
+    if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
+        wrong = f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}"
+        raise InputError(f"{wrong}; expected only metrics from {', '.join(COSTS)}")
 
 
 def measure_costs(overrides: tuple[str, ...], timed: bool) -> MeasuredRun:

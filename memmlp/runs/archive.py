@@ -22,6 +22,7 @@ from memmlp.runs.run import Run
 
 MAX_FILES = 1000
 MAX_SIZE = 4 * 10**9  # default limit for the total size of all files, bytes
+METHODS = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED  # others do not limit the unpacked size
 PART = r"\w[\w.-]{0,99}"  # a folder or file name; not ".."
 PATTERNS = {*Run.FILES, "notes.json", "DONE"} - {"FAILED", "STOP", "PRIORITY"}
 ALLOWED = re.compile("|".join(re.escape(pattern).replace(r"\*", PART) for pattern in sorted(PATTERNS)))
@@ -82,6 +83,8 @@ def _check_names(archive: zipfile.ZipFile, path: Path, max_size: int) -> str:
         folder, _, file = name.partition("/")
         if folder != run_id or not ALLOWED.fullmatch(file):
             raise InputError(f"{path}: {name!r} is not a file of run {run_id}")
+    if any(one.compress_type not in METHODS for one in archive.infolist()):
+        raise InputError(f"{path}: must be stored or deflated, as memmlp runs export does")
     if (total := sum(one.file_size for one in archive.infolist())) > max_size:
         raise InputError(f"{path}: must be at most {max_size / 1e9:.1f} GB (--max-gb), not {total / 1e9:.1f}")
     return run_id

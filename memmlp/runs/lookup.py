@@ -140,7 +140,8 @@ def edit_notes(run: Run, **changes: Any) -> Notes:
     notes = replace(
         notes, tags=tuple(sorted(set(notes.tags))), note=notes.note.strip(), name=notes.name.strip()
     )
-    if bad := [tag for tag in notes.tags if not TAG.fullmatch(tag)]:
+    added = set(changes.get("tags", ())).difference(read_notes(run).tags)
+    if bad := sorted(tag for tag in added if not TAG.fullmatch(tag)):
         raise InputError(f"tag '{bad[0]}': must be up to 64 letters, digits and . _ + / : -")
     if len(notes.note) > MAX_LENGTH:
         raise InputError(f"note: must have at most {MAX_LENGTH} characters, but has {len(notes.note)}")

@@ -56,6 +56,8 @@ def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None, monkeypatch: pyt
     (["14", "--out", "/proc/nothing/t.md"], ("--out /proc/nothing/t.md",)),
     (["14", "--mode", "both modes"], ("--mode",)),
     (["14", "--branch", "head"], ("--branch", "rotation", "combined")),
+    (["14", "--together", "("], ("--together (: not a regular expression (missing )",)),
+    (["all", "--untrained"], ("--untrained: sweep table01 shows MPJRE",)),
     (["5", "--untrained"], ("--untrained: sweep table05 shows MPJRE, MPJPE", "FLOPs, MACs")),
 ])  # fmt: skip
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):

@@ -115,6 +115,7 @@ BAD = {
     "broken command lines": [
         (["--no-such-flag"], ["--no-such-flag"]), (["-m", "--cfg", "job"], ["--multirun, --cfg", "only one"]),
         (["--config-dir", "nowhere"], ["nowhere", "existing folder"]),
+        (["hydra.searchpath=[file:///tmp]"], ["hydra.searchpath: use --config-dir"]),
         (["evaluation.metrics=[é]"], ["evaluation.metrics=['é']"]),
         (["refiner=null", "--cfg", "job"], ["refiner=null"]),
     ],

@@ -102,6 +102,13 @@ def test_no_other_name_is_unpacked(archive: Path, tmp_path: Path):
     assert list(tmp_path.rglob("*evil*")) == []
 
 
+def test_other_compression_is_refused(archive: Path, tmp_path: Path):
+    with zipfile.ZipFile(archive) as old, zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_LZMA) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    refused(tmp_path / "a.zip", tmp_path / "there", "must be stored or deflated")
+
+
 @pytest.mark.parametrize(("files", "words"), [
     ({"model.safetensors": b"WEIGHTS"}, "missing or changed files: model.safetensors"),
     ({"manifest.json": b"{}"}, "must contain a finished run"),

@@ -16,6 +16,7 @@ The translation is `trans` or `transl` (N, 3). The frame rate is `mocap_framerat
 `fps`. If a file has several of these arrays, the first in this list is used.
 """
 
+import io
 import math
 import warnings
 import zipfile
@@ -128,7 +129,11 @@ def _read_array(path: Path, file: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
         raise InputError(f"{found}; must be stored or deflate")
     if info.file_size > MAX_BYTES:
         raise InputError(f"{path}: {key} has {info.file_size} bytes; must have at most {MAX_BYTES}")
-    return file[key]
+    stream = io.BytesIO(file.zip.read(info))  # all bytes, so that their checksum is checked
+    array = np.lib.format.read_array(stream, allow_pickle=False)
+    if stream.read(1):
+        raise InputError(f"{path}: {key} has more bytes than an array {array.dtype} {array.shape}")
+    return array
 
 
 def _read_columns(path: Path, file: np.lib.npyio.NpzFile, key: str, widths: Sequence[int]) -> np.ndarray:

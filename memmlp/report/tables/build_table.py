@@ -395,10 +395,11 @@ def group_clips(
     before = count_groups(runs)
     for pattern in patterns:
         try:
-            merged = regroup([pattern])
-        except InputError as error:
-            raise InputError(f"--together {pattern}: {str(error).partition(': ')[2]}") from None
-        if re.compile(pattern).groups == 0:
+            captured = re.compile(pattern).groups
+        except re.error as error:
+            raise InputError(f"--together {pattern}: not a regular expression ({error})") from None
+        merged = regroup([pattern])
+        if captured == 0:
             raise InputError(f"--together {pattern}: must have (parentheses) around the text of a group")
         if count_groups(merged) == before:
             raise InputError(f"--together {pattern}: must match clips in different groups; nothing to merge")

@@ -104,6 +104,10 @@ class MLflow:
         local = self.place.startswith("sqlite:")
         with FileLock(self.outputs / ".mlflow.lock") if local else contextlib.nullcontext():
             client = MlflowClient(tracking_uri=self.place)
+            stray = Path(quote(str(self.outputs.absolute())))
+            if local and stray != self.outputs.absolute():
+                with contextlib.suppress(OSError):  # MLflow makes an empty folder with the URL's escapes
+                    os.removedirs(stray)
             if client.get_experiment_by_name(EXPERIMENT) is None:
                 artifacts = (self.outputs.absolute() / "mlflow-artifacts").as_uri() if local else None
                 with contextlib.suppress(MlflowException):  # another process has created it meanwhile
