@@ -4,6 +4,9 @@ At the loopback address, the Host header of a request must name that address; th
 At any other address, each request needs the token. The printed address contains the token; the server then
 moves it to a cookie, to keep it out of the browser's history. Requests from pages of other sites are refused,
 except for links to the page. These rules come before everything else.
+
+The number of connections is limited, and so is that of threads. At the limit, a new connection closes the one
+that has waited longest for a request. So clients that send slowly or nothing do not delay others.
 """
 
 from __future__ import annotations
@@ -11,10 +14,12 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import math
 import re
 import secrets
 import socket
 import threading
+import time
 import urllib.parse
 from collections.abc import Iterable, Mapping
 from email.message import Message
@@ -29,8 +34,10 @@ from memmlp.common.errors import InputError
 HOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 COOKIE = "memmlp_token"
 MIN_LENGTH = 16  # characters of a token
+MAX_CONNECTIONS, MAX_STREAMS = 100, 50  # open connections, and those of them with events
 MAX_BODY = 1000  # bytes of a request's body
-TIMEOUT = 60  # seconds without progress before a connection is closed
+MAX_WAIT = 10.0  # seconds for a request to arrive completely
+MAX_SEND_WAIT = 60  # seconds without progress while an answer is sent
 TEXT = "text/plain; charset=utf-8"
 TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "vrm": "model/gltf-binary"}
 
@@ -46,8 +53,8 @@ def find_content_type(name: str) -> str:
 
 
 def build_security_policy(index: str, *scripts: str) -> str:
-    """Return a page's Content-Security-Policy: scripts are its own, those of `scripts`, and the import map in
-    `index`."""
+    """Return a page's Content-Security-Policy; it allows only the page's own scripts, the import map in its
+    HTML `index`, and further sources of `scripts`."""
     inline = re.search(r'<script type="importmap">(.*?)</script>', index, re.DOTALL)
     assert inline is not None
     digest = base64.b64encode(hashlib.sha256(inline[1].encode()).digest()).decode()
@@ -59,8 +66,8 @@ def build_security_policy(index: str, *scripts: str) -> str:
 
 
 class AccessRules:
-    """The access rules of a server at `host`. Its `token` is None at the loopback address, and random by
-    default."""
+    """The access rules of a server that listens at `host`. Its `token` is None at the loopback address, else
+    the given one or a new random one."""
 
     def __init__(self, host: str, token: str | None = None):
         self.host = host
@@ -114,9 +121,14 @@ class PageHandler(BaseHTTPRequestHandler):
     """Answers one request of a page; subclasses define `answer`."""
 
     server: PageServer
-    timeout = TIMEOUT
+    timeout = MAX_SEND_WAIT
     max_body = MAX_BODY
     body: bytes
+
+    def handle_one_request(self) -> None:
+        """Wait for a request, and answer it."""
+        self.server.set_waiting(self.connection, time.monotonic())
+        super().handle_one_request()
 
     def parse_request(self) -> bool:
         """Read a request, and return whether it may be answered; otherwise, send the reason."""
@@ -131,6 +143,7 @@ class PageHandler(BaseHTTPRequestHandler):
         if len(length) > 9 or int(length) > self.max_body:
             return self._refuse(413, f"Content-Length: must be at most {self.max_body}")
         self.body = self.rfile.read(int(length))
+        self.server.set_waiting(self.connection, math.inf)
         return True
 
     def _refuse(self, code: int, reason: str) -> bool:
@@ -165,9 +178,14 @@ class PageHandler(BaseHTTPRequestHandler):
     def send_events(self, events: Iterable[bytes]) -> None:
         """Send server-sent events one by one, until the events end or the page is closed."""
         self.close_connection = True
-        self._send_head(200, "text/event-stream", {"Connection": "close"})
-        for event in events:
-            self.wfile.write(event)
+        if not self.server.streams.acquire(blocking=False):
+            return self.send(503, TEXT, b"too many open pages; close some\n")
+        try:
+            self._send_head(200, "text/event-stream", {"Connection": "close"})
+            for event in events:
+                self.wfile.write(event)
+        finally:
+            self.server.streams.release()
 
     def _send_head(self, code: int, kind: str, headers: Mapping[str, str]) -> None:
         self.send_response(code)
@@ -182,10 +200,11 @@ class PageHandler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def version_string(self) -> str:
+        """Return the name of the server."""
         return "memmlp"
 
     def log_message(self, format: str, *args: Any) -> None:
-        pass
+        """Log nothing."""
 
 
 class PageServer(ThreadingHTTPServer):
@@ -203,6 +222,8 @@ class PageServer(ThreadingHTTPServer):
         self, handler: type[PageHandler], port: int, host: str = HOST, token: str | None = None
     ) -> None:
         self.access = AccessRules(host, token)
+        self.lock, self.streams = threading.Lock(), threading.Semaphore(MAX_STREAMS)
+        self.waiting: dict[Any, float] = {}  # open connections, and since when each waits for a request
         try:
             super().__init__((host, port), handler)
         except (OSError, OverflowError) as error:
@@ -219,11 +240,49 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """The page's address, with the token if one is needed; for 0.0.0.0, the address for other
+        """The page's address, with the token if one is needed; for a server at all addresses, that for other
         machines."""
         name = find_own_address() if self.server_name == EVERYWHERE else self.server_name
         token = self.access.token
         return f"http://{name}:{self.server_port}/" + (f"?token={urllib.parse.quote(token)}" if token else "")
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Start a thread for a connection. At the limit, close the connection that waits longest, or this."""
+        with self.lock:
+            full = len(self.waiting) >= MAX_CONNECTIONS
+            if full and self.waiting[oldest := min(self.waiting, key=self.waiting.__getitem__)] < math.inf:
+                self._close_connection(oldest)
+                full = False
+            if not full:
+                self.waiting[request] = time.monotonic()
+        if full:
+            self.shutdown_request(request)
+        else:
+            super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection at the end of its thread."""
+        with self.lock:
+            self.waiting.pop(request, None)
+        super().shutdown_request(request)
+
+    def set_waiting(self, connection: Any, since: float) -> None:
+        """Record since when a connection waits for a request; infinity while it is answered."""
+        with self.lock:
+            if connection in self.waiting:
+                self.waiting[connection] = since
+
+    def service_actions(self) -> None:
+        """Close connections whose requests take too long to arrive; called several times a second."""
+        with self.lock:
+            for connection, since in list(self.waiting.items()):
+                if since < time.monotonic() - MAX_WAIT:
+                    self._close_connection(connection)
+
+    def _close_connection(self, connection: Any) -> None:
+        del self.waiting[connection]
+        with contextlib.suppress(OSError):  # raised if its thread closed it
+            connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the error: an interrupted request does not affect other pages."""

@@ -3,6 +3,7 @@ reader of the format turns the result back into the given text."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import io
@@ -11,6 +12,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ HOME = re.compile(
 UNUSUAL_NUMBER = re.compile(
     r"(?<==)[+-]?(?:0\d[\d_]*|\d+_[\d_]*\d)$"
 )  # a key of a number accepts it as text, too
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "'")
 
 TEX_ESCAPES = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
@@ -34,13 +37,17 @@ TEX_ESCAPES = {
 
 
 def join_command(words: Iterable[str]) -> str:
-    """Return a command's words as a line for a shell."""
+    """Return a command's words as a line for bash; control characters become escapes such as $'\\x0a'."""
     return " ".join(map(_quote_word, words))
 
 
 def _quote_word(word: str) -> str:
-    readable = "'" in word and word.isprintable() and not set(word) & {*'"$`!\\'}
-    return f'"{word}"' if readable else shlex.quote(word)
+    if word.isprintable():
+        simple = "'" in word and not set(word) & {*'"$`!\\'}
+        return f'"{word}"' if simple else shlex.quote(word)
+    plain = (letter if letter.isprintable() and letter not in "'\\" else None for letter in word)
+    escaped = ("".join(f"\\x{byte:02x}" for byte in os.fsencode(letter)) for letter in word)
+    return "$'" + "".join(one or other for one, other in zip(plain, escaped, strict=True)) + "'"
 
 
 def make_override(key: str, text: str) -> str:
@@ -68,9 +75,16 @@ def keep_text(override: str) -> str:
     return HOME.sub(lambda m: m[0] if m[1] else make_override("", os.path.expanduser(m[0]))[1:], override)
 
 
+def make_sqlite_url(path: Path) -> str:
+    """Return the SQLAlchemy URL of an absolute path of an SQLite file."""
+    from urllib.parse import quote
+
+    return f"sqlite:///{quote(str(path))}"
+
+
 def make_key(text: str, allowed: str, max_length: int) -> str:
-    """Return a key of another program for a text. Different texts get different keys. `allowed` is the inside
-    of a regular expression's character class."""
+    """Return a key of another program for a text; texts that must be changed get different keys. `allowed` is
+    the inside of a character class of a regular expression."""
     key = re.sub(rf"[^{allowed}]|(?<=\.)\.|(?<=/)/|(?<![^/])\.(?![^/])|^/|/$", "_", text)
     if key == text and len(key) <= max_length:
         return key
@@ -91,15 +105,26 @@ def escape_markdown(text: str) -> str:
 
 
 def format_csv(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows as CSV."""
+    """Return rows as CSV. A text that a spreadsheet would run as a formula gets a ' in front."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    csv.writer(text, lineterminator="\n").writerows(map(_guard, row) for row in rows)
     return text.getvalue()
+
+
+def _guard(cell: Any) -> Any:
+    return f"'{cell}" if isinstance(cell, str) and _is_formula(cell) else cell
+
+
+def _is_formula(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return float(text) is None
+    return text.startswith(FORMULA_STARTS)
 
 
 def parse_csv(text: str) -> list[dict[str, str]]:
     """Return the rows of `format_csv`, by the names in its first row."""
-    return list(csv.DictReader(io.StringIO(text, newline="")))
+    rows = [[cell.removeprefix("'") for cell in row] for row in csv.reader(io.StringIO(text, newline=""))]
+    return [dict(zip(rows[0], row, strict=True)) for row in rows[1:]]
 
 
 def make_console(**options: Any) -> Console:

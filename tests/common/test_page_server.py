@@ -1,7 +1,9 @@
-"""Who may ask a page's server and change something, and clients that are hostile."""
+"""Who may ask a page's server and change something, and clients that are slow, many or hostile."""
 
 import contextlib
 import socket
+import threading
+import time
 from collections.abc import Iterator, Mapping
 from email.message import Message
 from urllib.parse import quote
@@ -9,6 +11,7 @@ from urllib.parse import quote
 import pytest
 from processes import PATIENCE
 
+from memmlp.common import page_server
 from memmlp.common.errors import InputError
 from memmlp.common.page_server import (
     COOKIE,
@@ -102,11 +105,12 @@ def connect(server: PageServer, content: bytes = b"") -> Iterator[socket.socket]
         yield client
 
 
-def ask(server: PageServer, method: str = "GET", body: bytes = b"", **given: str) -> int:
-    """Return the status of the answer to a request."""
+def ask(server: PageServer, method: str = "GET", body: bytes = b"", **given: str) -> tuple[int, float]:
+    """Return the status of the answer to a request, and the seconds until it came."""
     lines = [f"{name.replace('_', '-')}: {value}" for name, value in {"Host": "localhost", **given}.items()]
+    begin = time.monotonic()
     with connect(server, "\r\n".join([f"{method} / HTTP/1.1", *lines, "", ""]).encode() + body) as client:
-        return int(client.recv(1000).split()[1])
+        return int(client.recv(1000).split()[1]), time.monotonic() - begin
 
 
 def test_bodies_are_bounded(server: PageServer):
@@ -114,9 +118,9 @@ def test_bodies_are_bounded(server: PageServer):
     refused = {MAX_BODY + 1: 413, "9" * 5000: 413, -1: 411, "x": 411, "+4": 411, "": 411}
     for length, code in (accepted | refused).items():
         body = b"x" * (length if isinstance(length, int) and 0 < length <= MAX_BODY else 4)
-        assert ask(server, "POST", body, Content_Length=str(length)) == code, length
-    assert ask(server, "POST", b"4\r\nxxxx\r\n0\r\n\r\n", Transfer_Encoding="chunked") == 411
-    assert ask(server, "POST") == 200
+        assert ask(server, "POST", body, Content_Length=str(length))[0] == code, length
+    assert ask(server, "POST", b"4\r\nxxxx\r\n0\r\n\r\n", Transfer_Encoding="chunked")[0] == 411
+    assert ask(server, "POST")[0] == 200
     evil = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"  # a body is not the next request
     with connect(
         server, b"GET / HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(evil) + evil
@@ -128,9 +132,9 @@ def test_bodies_are_bounded(server: PageServer):
 
 @pytest.mark.parametrize("method", ["GET", "POST", "HEAD", "PUT", "OPTIONS", "NONE"])
 def test_the_host_comes_before_everything_else(server: PageServer, method: str):
-    assert ask(server, method, Host="evil.example", Content_Length="-1") == 403
+    assert ask(server, method, Host="evil.example", Content_Length="-1")[0] == 403
     assert (
-        ask(server, method, Host="evil.example", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate")
+        ask(server, method, Host="evil.example", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate")[0]
         == 403
     )
 
@@ -145,3 +149,44 @@ def test_a_link_from_another_site_keeps_its_token():
     assert answer.startswith(b"HTTP/1.1 200")
     assert b"Refresh: 0; url=/" in answer
     assert b"SameSite=Strict" in answer
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nx"]
+)
+def test_sixty_slow_clients_do_not_delay_another(
+    server: PageServer, monkeypatch: pytest.MonkeyPatch, content: bytes
+):
+    monkeypatch.setattr(page_server, "MAX_CONNECTIONS", 20)
+    before = threading.active_count()
+    with contextlib.ExitStack() as stack:
+        slow = [stack.enter_context(connect(server, content)) for _ in range(60)]
+        assert ask(server) == (200, pytest.approx(0, abs=1))
+        assert len(server.waiting) <= 20
+        while threading.active_count() > before + 20:
+            time.sleep(0.01)
+        assert slow[0].recv(10) == b""  # the oldest one was closed
+        monkeypatch.setattr(page_server, "MAX_WAIT", 0.2)
+        end = time.monotonic() + PATIENCE
+        while server.waiting and time.monotonic() < end:
+            with contextlib.suppress(OSError):
+                slow[-1].sendall(b"x")  # a byte now and then does not keep it open
+            time.sleep(0.05)
+        assert not server.waiting
+
+
+def test_open_pages_leave_room_for_other_requests(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(page_server, "MAX_STREAMS", 3)
+    stopped = threading.Event()
+    monkeypatch.setattr(
+        Handler,
+        "answer",
+        lambda self, path, query: self.send_events(b"quiet" for _ in iter(lambda: stopped.wait(0.01), True)),
+    )
+    with PageServer(Handler, 0) as server, contextlib.ExitStack() as stack:
+        request = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        pages = [stack.enter_context(connect(server, request)) for _ in range(3)]
+        assert all(b" 200 " in page.recv(100) for page in pages)
+        assert ask(server)[0] == 503
+        assert ask(server, "POST") == (200, pytest.approx(0, abs=1))
+        stopped.set()

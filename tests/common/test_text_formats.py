@@ -17,7 +17,6 @@ from benchmarks.nasty_names import PIECES
 from memmlp.common import text_formats as formats
 from memmlp.common.errors import InputError
 from memmlp.config.compose import compose_config
-from memmlp.runs.loggers.mlflow import MLflow
 
 texts = st.lists(st.sampled_from(PIECES), max_size=12).map("".join)
 quickly = settings(max_examples=200, deadline=None, derandomize=True, database=None)
@@ -42,9 +41,11 @@ def test_bash_reads_the_words_of_a_command(words: list[str]):
 
 @quickly
 @given(st.lists(texts, min_size=2, max_size=2))
-def test_csv_keeps_texts(cells: list[str]):
+def test_csv_keeps_texts_and_has_no_formulas(cells: list[str]):
     text = formats.format_csv([["a", "b"], cells])
     assert formats.parse_csv(text) == [dict(zip("ab", cells, strict=True))]
+    printed = [cell.strip('"') for cell in text.split("\n", 1)[1].split(",")]
+    assert not printed[0].startswith(("=", "@", "\t"))
 
 
 @quickly
@@ -74,8 +75,8 @@ def test_keys_of_different_texts_differ(pair: set[str]):
 @quickly
 @given(texts)
 def test_sqlite_urls(text: str):
-    outputs = Path(f"/home/{text}")
-    assert make_url(MLflow(None, outputs).place).database == str(outputs / "mlflow.db")
+    path = Path(f"/home/{text}/mlflow.db")
+    assert make_url(formats.make_sqlite_url(path)).database == str(path)
 
 
 def test_home_in_overrides(monkeypatch: pytest.MonkeyPatch):

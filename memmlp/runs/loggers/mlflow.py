@@ -15,7 +15,7 @@ from urllib.parse import quote
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings, setting
-from memmlp.common.text_formats import make_key
+from memmlp.common.text_formats import make_key, make_sqlite_url
 from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ class MLflow:
     @property
     def place(self) -> str:
         """The URI of MLflow's tracking store."""
-        local = quote(str(self.outputs.absolute() / "mlflow.db"))
-        return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{local}"
+        local = make_sqlite_url(self.outputs.absolute() / "mlflow.db")
+        return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or local
 
     def fingerprint(self, run_id: str) -> str | None:
         """Return the fingerprint that MLflow stores for a finished run; None without one."""
@@ -103,6 +103,8 @@ class MLflow:
         self.outputs.mkdir(parents=True, exist_ok=True)
         local = self.place.startswith("sqlite:")
         with FileLock(self.outputs / ".mlflow.lock") if local else contextlib.nullcontext():
+            if self.place == make_sqlite_url(database := self.outputs.absolute() / "mlflow.db"):
+                database.touch()  # with the mode of other files; SQLite's own is 0644
             client = MlflowClient(tracking_uri=self.place)
             stray = Path(quote(str(self.outputs.absolute())))
             if local and stray != self.outputs.absolute():

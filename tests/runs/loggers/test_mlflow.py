@@ -1,6 +1,7 @@
 """MLflow shows what the run folder holds, once, and replaces what it had."""
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +131,13 @@ def test_any_folder_and_any_tag_and_a_deleted_experiment_is_restored_without_rep
     name, tags = "a?b#c 50%20d", ["a+b", "a//b", "v1/../y", "é"]
     logger, run = MLflow(None, outputs := tmp_path / name / "outputs"), a_run(tmp_path / name / "outputs")
     add_tags(run, tags)
-    assert sync_runs(logger, [run], print) == {"shown": 1}
+    before = os.umask(0o002)
+    try:
+        assert sync_runs(logger, [run], print) == {"shown": 1}
+    finally:
+        os.umask(before)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+    assert (outputs / "mlflow.db").stat().st_mode & 0o777 == 0o664
     found = shown(outputs)[run.id].data.tags
     assert {value for key, value in found.items() if key.startswith("memmlp.label.")} == {*tags}
     add_tags(run, ["again"])
