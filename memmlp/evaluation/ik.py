@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.functional import jacobian
 
-from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_POSITION
+from memmlp.motion.body import HEAD, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_POSITION
 from memmlp.motion.geometry import (
     axis_angle_to_matrix,
     forward_kinematics,
@@ -23,7 +23,8 @@ from memmlp.motion.geometry import (
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.limb_solver import bend_arms_to_trackers, use_tracker_rotations
 
-Objective = Callable[[Tensor, Tensor], Tensor]
+Objective = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Maps variables (n, D) and their rows (n,) to values (n,) and gradients (n, D)."""
 
 
 class NoIK:
@@ -53,7 +54,7 @@ class LBFGS:
     """
 
     iterations: int = 15
-    chunk: int = 4096
+    chunk: int = 1024
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
         """Return {"combined": motion}: the motion (N, 198) with the best-fitting rotations.
@@ -122,11 +123,22 @@ class JointDistance:
     def __init__(self, start: Tensor, target: Tensor, rest: Tensor):
         self.start, self.target, self.rest = start, target, rest
         self.unit = _compute_units(tuple(rest.flatten().tolist()), rest.dtype, rest.device)
+        self.below = _find_joints_below().to(rest)
 
-    def __call__(self, increment: Tensor, rows: Tensor) -> Tensor:
-        """Return the objective (n,) at increments (n, 66) for the frames `rows` (n,)."""
-        joints = _compute_joints(self.start[rows], self.scale_increment(increment), self.rest)
-        return (joints - self.target[rows]).square().sum((1, 2))
+    def __call__(self, increment: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the objective (n,) and its gradient (n, 66) at increments (n, 66) for the frames `rows`
+        (n,). A small turn of a joint moves the joints below it, so its gradient is their torque about it."""
+        turn = self.scale_increment(increment)
+        rotations, positions = _pose(self.start[rows], turn, self.rest)
+        error = positions - positions[:, HEAD : HEAD + 1] - self.target[rows]
+        force = 2 * error
+        force[:, HEAD] -= force.sum(1)
+        moment = torch.linalg.cross(positions, force)
+        force, moment = (self.below @ torch.cat([force, moment], -1)).split(3, -1)
+        torque = moment - torch.linalg.cross(positions, force)
+        local = (torque[..., None, :] @ rotations)[..., 0, :]
+        gradient = _transpose_right_jacobian(turn, local) * self.unit
+        return error.square().sum((1, 2)), gradient.flatten(1)
 
     def apply_increment(self, increment: Tensor) -> Tensor:
         """Return the local rotations (N, 22, 3, 3) after increments (N, 66)."""
@@ -137,17 +149,36 @@ class JointDistance:
         return increment.unflatten(-1, (N_JOINTS, 3)) * self.unit
 
 
-def _compute_joints(start: Tensor, turn: Tensor, rest: Tensor) -> Tensor:
-    """Return the joint positions (n, 22, 3) relative to the head, metres.
+def _pose(start: Tensor, turn: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Return global rotations (n, 22, 3, 3) and joint positions (n, 22, 3) relative to the root, metres.
 
     Args:
         start: local rotations (n, 22, 3, 3).
         turn: axis-angle increments (n, 22, 3); they multiply `start` from the right.
         rest: rest positions (22, 3), metres.
     """
-    local = start @ axis_angle_to_matrix(turn)
-    _, positions = forward_kinematics(local, torch.zeros_like(local[:, 0, 0]), rest)
-    return positions - positions[:, HEAD : HEAD + 1]
+    return forward_kinematics(start @ axis_angle_to_matrix(turn), torch.zeros_like(turn[:, 0]), rest)
+
+
+@lru_cache(maxsize=1)
+def _find_joints_below() -> Tensor:
+    """Return (22, 22): 1 where a column's joint is the row's joint or moves with it."""
+    below = torch.eye(N_JOINTS)
+    for joint in reversed(range(1, N_JOINTS)):
+        below[PARENTS[joint]] += below[joint]
+    return below
+
+
+def _transpose_right_jacobian(turn: Tensor, vector: Tensor) -> Tensor:
+    """Return J^T v (..., 3), where exp(turn + d) = exp(turn) exp(J d) for small d (Chirikjian 2011)."""
+    square = turn.square().sum(-1, keepdim=True)
+    small = square < 1e-4
+    safe = torch.where(small, 1, square)
+    angle = safe.sqrt()
+    first = torch.where(small, 0.5 - square / 24, (1 - angle.cos()) / safe)
+    second = torch.where(small, 1 / 6 - square / 120, (angle - angle.sin()) / (safe * angle))
+    once = torch.linalg.cross(turn, vector)
+    return vector + first * once + second * torch.linalg.cross(turn, once)
 
 
 @lru_cache(maxsize=8)
@@ -159,9 +190,12 @@ def _compute_units(rest: tuple[float, ...], dtype: torch.dtype, device: torch.de
     """
     still = torch.eye(3, dtype=dtype, device=device).expand(1, N_JOINTS, 3, 3)
     pose = torch.tensor(rest, dtype=dtype, device=device).unflatten(0, (N_JOINTS, 3))
-    moved = jacobian(
-        lambda turn: _compute_joints(still, turn[None], pose)[0].flatten(), torch.zeros_like(pose)
-    )
+
+    def place(turn: Tensor) -> Tensor:
+        _, positions = _pose(still, turn[None], pose)
+        return (positions - positions[:, HEAD : HEAD + 1]).flatten()
+
+    moved = jacobian(place, torch.zeros_like(pose))
     return (2 * moved.square().sum(0).mean(-1, keepdim=True) + LEVER).rsqrt()
 
 
@@ -193,25 +227,14 @@ def minimise(objective: Objective, x: Tensor, iterations: int, history: int = 10
     Returns:
         The final variables (N, D).
     """
-    everyone = torch.arange(len(x), device=x.device)
-    value, gradient = compute_value_and_gradient(objective, x, everyone)
+    value, gradient = objective(x, torch.arange(len(x), device=x.device))
     steps: list[Curvature] = []
     for _ in range(iterations):
         direction = -apply_inverse_hessian(gradient, steps)
-        after, value = search_step_length(objective, x, value, gradient, direction)
-        _, new_gradient = compute_value_and_gradient(objective, after, everyone)
+        after, value, new_gradient = search_step_length(objective, x, value, gradient, direction)
         steps = [*steps, compute_curvature(after - x, new_gradient - gradient)][-history:]
         x, gradient = after, new_gradient
     return x
-
-
-def compute_value_and_gradient(objective: Objective, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the objective (N,) and its gradient (N, D)."""
-    with torch.enable_grad():
-        x = x.detach().requires_grad_()
-        value = objective(x, rows)
-        (gradient,) = torch.autograd.grad(value.sum(), x)
-    return value.detach(), gradient
 
 
 def compute_curvature(x: Tensor, gradient: Tensor) -> Curvature:
@@ -253,22 +276,23 @@ def estimate_initial_scale(gradient: Tensor, steps: list[Curvature]) -> Tensor:
 
 def search_step_length(
     objective: Objective, x: Tensor, value: Tensor, gradient: Tensor, direction: Tensor
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Halve each row's step until it satisfies Armijo's condition.
 
     Returns:
-        Variables (N, D) and values (N,) after the step. A row stays unchanged if no step satisfies the
-        condition.
+        Variables (N, D), values (N,) and gradients (N, D) after the step. A row stays unchanged if no step
+        satisfies the condition.
     """
     slope = (gradient * direction).sum(-1)
     rows = (slope < 0).nonzero()[:, 0]
-    x, value, length = x.clone(), value.clone(), 1.0
+    x, value, gradient, length = x.clone(), value.clone(), gradient.clone(), 1.0
     for _ in range(HALVINGS):
         trial = x[rows] + length * direction[rows]
-        reached = objective(trial, rows)
+        reached, slopes = objective(trial, rows)
         good = reached <= value[rows] + ARMIJO * length * slope[rows]
-        x[rows[good]], value[rows[good]] = trial[good], reached[good]
+        found = rows[good]
+        x[found], value[found], gradient[found] = trial[good], reached[good], slopes[good]
         rows, length = rows[~good], length / 2
         if not len(rows):
             break
-    return x, value
+    return x, value, gradient

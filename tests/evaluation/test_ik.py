@@ -67,8 +67,18 @@ def test_the_objective_is_the_distance_that_is_measured():
     target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
     expected = (NORMALIZER.compute_positions(motion, SPARSE) - target).square().sum((1, 2))
     rows = torch.arange(len(motion))
-    value = objective(motion)(torch.zeros(len(motion), 66, dtype=torch.float64), rows)
+    value, _ = objective(motion)(torch.zeros(len(motion), 66, dtype=torch.float64), rows)
     torch.testing.assert_close(value.float(), expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-4, 1.0, 3.0])
+def test_the_gradient_is_that_of_differences(size):
+    measure, rows = objective(perturbed(0.3)[:4]), torch.arange(4)
+    x = size * torch.randn(4, 66, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    _, gradient = measure(x, rows)
+    for column, step in enumerate(1e-6 * torch.eye(66, dtype=torch.float64)):
+        slope = (measure(x + step, rows)[0] - measure(x - step, rows)[0]) / 2e-6
+        torch.testing.assert_close(gradient[:, column], slope, atol=1e-7, rtol=1e-6)
 
 
 @pytest.mark.parametrize("angle", [0.0, torch.pi - 1e-4, torch.pi])
