@@ -43,6 +43,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 
 CHECKED_FRAMES = 8  # frames at the start of a stream that are computed both together and one by one
+MAX_WINDOWS = 64  # in a call with fewer clips
 MIXED_FRAMES = 4  # frames at the end of two clips that are computed both together and beside a copy
 
 
@@ -68,33 +69,47 @@ def predict_frame_by_frame(network: MotionModel, clips: Sequence[Tensor], size: 
 
     The last call in each window of `size` frames gives the motion for the whole window. The last window of a
     clip may be shorter. With `size` 1, this is a live stream. It may have several frames in a call if that
-    gives the same motion (`MotionModel.frames_per_call`).
+    gives the same motion (`MotionModel.advance_frames`).
     """
     order, lengths, inputs = _sort_and_pad(clips)
-    step = count_frames_per_call(network, inputs) if size == 1 else 1
+    most = count_frames_per_call(network, inputs) if size == 1 else 1
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
-    active = len(clips)
-    for t in progress_bar(range(0, lengths[0], step), "stream", unit="calls"):
-        while lengths[active - 1] <= t:  # the clips are sorted by length, so the last ones end first
-            active -= 1
-            state = {name: tensor[:active] for name, tensor in state.items()}
-        since, end = t - t % size, min(t + step, lengths[0])
-        output, state = network.advance(inputs[:active, t:end], state, end - since)
-        motion[:active, since:end] = output[:, since - end :]  # overwrites earlier calls
+    for t, end in progress_bar(_plan_calls(lengths, most, network.windowless), "stream", unit="calls"):
+        active = sum(length > t for length in lengths)  # sorted by length, so the last ones end first
+        state = {name: tensor[:active] for name, tensor in state.items()}
+        if size == 1:
+            motion[:active, t:end], state = network.advance_frames(inputs[:active, t:end], state)
+        else:
+            since = t - t % size
+            output, state = network.advance(inputs[:active, t:end], state, end - since)
+            motion[:active, since:end] = output[:, since - end :]  # overwrites earlier calls
     return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
+
+
+def _plan_calls(lengths: Sequence[int], most: int, windowless: bool) -> list[tuple[int, int]]:
+    """Return each call's first frame and end, for at most `most` frames per call. With a window per frame, a
+    call has at most MAX_WINDOWS windows, unless it has more clips."""
+    calls, t = [], 0
+    while t < lengths[0]:
+        active = sum(length > t for length in lengths)
+        count = most if windowless else max(1, min(most, MAX_WINDOWS // active))
+        calls.append((t, min(t + count, lengths[0])))
+        t += count
+    return calls
 
 
 @torch.no_grad()
 def count_frames_per_call(network: MotionModel, inputs: Tensor) -> int:
     """Return `network.frames_per_call`, or 1 if the first of inputs (B, N, 54) depend on later ones."""
     if network.frames_per_call > 1:
-        state, begin = network.initial_state(len(inputs)), inputs[:, :CHECKED_FRAMES]
-        together, singly = network.advance(begin, state)[0], []
-        for frame in begin.split(1, 1):
-            motion, state = network.advance(frame, state, 1)
+        begin = inputs[:, : min(CHECKED_FRAMES, network.frames_per_call)]
+        state = network.initial_state(len(inputs))
+        together, singly = network.advance_frames(begin, state)[0], []
+        for frame in begin.unbind(1):
+            motion, state = network.advance_frame(frame, state)
             singly.append(motion)
-        if not torch.allclose(together, torch.cat(singly, 1), atol=1e-3):
+        if not torch.allclose(together, torch.stack(singly, 1), atol=1e-3):
             return 1
     return network.frames_per_call
 

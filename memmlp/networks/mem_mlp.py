@@ -225,6 +225,7 @@ class MemMLP(MotionModel):
     """
 
     graph = MemMLPGraph
+    advance_frames = MotionModel.advance_windows
 
     def __init__(
         self,
@@ -243,6 +244,7 @@ class MemMLP(MotionModel):
         self.blocks = nn.ModuleList(memory.make_block(layer) for layer in range(1, depth + 1))
         self.predictor = predictor
         self.branches = predictor.branches
+        self.frames_per_call = memory.frames_per_call
 
     @classmethod
     def assemble(

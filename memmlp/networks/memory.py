@@ -131,12 +131,14 @@ class Memory(nn.Module):
         frames: T, the window's length.
         settled: whether a frame's recalled values never change, so that a stream may compute them once. A
             custom memory must set it to be exported as a streaming graph.
+        frames_per_call: maximum number of new frames that can be computed at once, each with its own window.
         streaming_recall: the class that computes the blocks' contributions in a streaming graph.
     """
 
     streaming_recall: ClassVar[type[Recall]] = Recall
 
     settled: bool = False
+    frames_per_call: int = 1
 
     def __init__(self, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
         super().__init__()
@@ -198,6 +200,7 @@ class NoMemory(Memory):
     """The empty memory: plain blocks, no past, no state."""
 
     settled = True
+    frames_per_call = 256
 
 
 @dataclass

@@ -6,6 +6,7 @@ import copy
 from typing import Any, ClassVar, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import SPARSE_DIM
@@ -52,8 +53,7 @@ class MotionModel(nn.Module):
         settled: whether the recalled values of a past frame never change, so that a live stream may keep
             them.
         windowless: whether both evaluation modes run the network as a stream; see WindowlessModel.
-        frames_per_call: number of new frames per call of a stream's evaluation. More than 1 needs a network
-            whose motion is the same, up to rounding, for calls with one frame each.
+        frames_per_call: maximum number of new frames in a call of `advance_frames`.
         is_stream: whether the network needs no future frames. If not, only window mode can evaluate it.
         takes_whole_clip: whether window mode passes a whole clip to `predict_clip`, which may overlap
             windows.
@@ -135,6 +135,29 @@ class MotionModel(nn.Module):
         motion, state = self.advance(sparse[:, None], state, 1)
         return motion[:, -1], state
 
+    def advance_frames(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+        """Process n new frames (B, n, 54) at once like n calls of `advance_frame`, up to rounding; return
+        their motion (B, n, 198) in the world, and the new state."""
+        return self.advance(sparse, state, sparse.shape[1])
+
+    def advance_windows(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+        """Compute `advance_frames` with a window for each new frame, if the state consists of the last frames
+        of some sequences, and a frame does not depend on the n frames before it except through its inputs."""
+        size, count = sparse.shape[:2]
+        if count == 1:
+            return self.advance(sparse, state, 1)
+        inputs, kept = self.append_inputs(sparse, state)
+        others = {name: tensor for name, tensor in state.items() if name not in kept}
+        windows = slide(inputs, self.past_frames, count)
+        later = {
+            name: slide(F.pad(each, (0, 0, 0, count)), each.shape[1], count) for name, each in others.items()
+        }
+        motion, after = self.advance(sparse.flatten(0, 1)[:, None], self.running_state(windows) | later, 1)
+        for name, tensor in others.items():
+            made = after[name][:, -1].unflatten(0, (size, count))
+            kept[name] = torch.cat([tensor, made], 1)[:, count:]
+        return motion[:, -1].unflatten(0, (size, count)), kept
+
     def predict_clip(self, sparse: Tensor) -> Tensor:
         """Map a clip's world inputs (N, 54), N >= T, to its world motion (N, 198); see `takes_whole_clip`."""
         raise NotImplementedError
@@ -195,6 +218,9 @@ class WindowlessModel(MotionModel):
 class WindowModel(MotionModel):
     """The base class of networks that map a window of inputs to its rotations (`predict_rotations`)."""
 
+    frames_per_call = 256
+    advance_frames = MotionModel.advance_windows
+
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         raise NotImplementedError
@@ -220,6 +246,8 @@ class NewestFrameModel(MotionModel):
     Both evaluation modes give the same numbers, except for rounding.
     """
 
+    frames_per_call = 256
+
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
         raise NotImplementedError
@@ -237,6 +265,11 @@ class NewestFrameModel(MotionModel):
         windows = torch.unflatten(encoded.index_select(1, window.flatten()), 1, window.shape)
         rotation = torch.unflatten(self.predict_rotations(windows.flatten(0, 1)), 0, (len(inputs), count))
         return self.normalizer.decode_rotations(rotation, inputs[:, -count:]), kept
+
+
+def slide(frames: Tensor, size: int, count: int) -> Tensor:
+    """Return the first `count` windows of `size` frames of (B, n, k): (B count, size, k)."""
+    return frames.unfold(1, size, 1)[:, :count].flatten(0, 1).transpose(1, 2)
 
 
 def fill_past(earlier: Tensor, first: Tensor, is_first_step: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from memmlp.evaluation.ik import NoIK
 from memmlp.evaluation.metric_facts import METRIC_SETS
 from memmlp.evaluation.modes import Evaluation, predict_stream, predict_windows
 from memmlp.motion.body import MOTION_DIM
+from memmlp.networks.motion_model import MotionModel
 
 
 def random_positions(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -77,26 +78,21 @@ def test_a_released_test_is_numpys(name: str):
     assert (not few) == (name in ("rpm", "ego_poser", "bodiffusion"))
 
 
-class Counter:
+class Counter(MotionModel):
     """A network that numbers its calls: frames' outputs show which call each came from."""
 
-    shift, frames, calls, normalizer = 0, 7, 0, tiny.normalizer()
-    windowless = takes_whole_clip = False
-    frames_per_call = 1
-
-    def initial_state(self, batch=1):
-        return {"motion": torch.zeros(batch, self.frames, MOTION_DIM)}
+    calls = 0
 
     def advance(self, sparse, state, newest=None):
         self.calls += 1
-        return torch.full((len(sparse), self.frames, MOTION_DIM), float(self.calls)), state
+        return torch.full((len(sparse), newest or self.frames, MOTION_DIM), float(self.calls)), state
 
 
 def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
-    clip = tiny.clip(17)
-    calls = predict_windows(Counter(), [clip])[0][:, 0]
+    clip, normalizer = tiny.clip(17), tiny.normalizer()
+    calls = predict_windows(Counter(normalizer, 7), [clip])[0][:, 0]
     assert calls.tolist() == [1.0] * 7 + [2.0] * 7 + [3.0] * 3
-    assert predict_stream(Counter(), [clip])[0][:, 0].tolist() == list(range(1, 18))
+    assert predict_stream(Counter(normalizer, 7), [clip])[0][:, 0].tolist() == list(range(1, 18))
 
 
 @pytest.mark.parametrize("length", [15, 21])

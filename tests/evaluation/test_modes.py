@@ -12,7 +12,7 @@ from memmlp.evaluation.modes import (
     predict_stream,
     predict_windows,
 )
-from memmlp.networks.memory import GRUMemory, LSTMMemory
+from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import WindowlessModel
 
 CLIPS = [tiny.clip(n, seed=n).double() for n in (25, 5, 20, 16)]  # windows of 7 or 8
@@ -35,11 +35,19 @@ def test_a_recurrent_memory_runs_over_each_frame_once(memory):
         torch.testing.assert_close(windowed, one, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["hmd_poser", "rpm", "vae_hmd", "recurrent_poser"])
+MODELS = {
+    "recurrent_poser": tiny.recurrent_poser, "vq": tiny.model, "none": lambda: tiny.model(NoMemory),
+}  # fmt: skip
+BASELINES = ["hmd_poser", "rpm", "vae_hmd", "avatar_poser", "agrol_mlp", "sage"]
+
+
+@pytest.mark.parametrize("name", [*MODELS, *BASELINES])
 @torch.no_grad()
 def test_several_frames_in_a_call_are_the_same_stream(name):
-    model = (tiny.recurrent_poser() if name == "recurrent_poser" else tiny.baseline(name)).double()
+    model = (MODELS[name]() if name in MODELS else tiny.baseline(name)).double()
+    assert model.frames_per_call >= 6
     model.frames_per_call = 6
+    assert count_frames_per_call(model, CLIPS[0][None, :, :54]) == 6
     several = predict_stream(model, CLIPS)
     model.frames_per_call = 1
     for made, expected in zip(several, predict_stream(model, CLIPS), strict=True):
