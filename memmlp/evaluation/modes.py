@@ -19,6 +19,7 @@ Some networks are evaluated differently in window mode:
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -104,11 +105,12 @@ def count_frames_per_call(network: MotionModel, inputs: Tensor) -> int:
     """Return `network.frames_per_call`, or 1 if the first of inputs (B, N, 54) depend on later ones."""
     if network.frames_per_call > 1:
         begin = inputs[:, : min(CHECKED_FRAMES, network.frames_per_call)]
-        state = network.initial_state(len(inputs))
-        together, singly = network.advance_frames(begin, state)[0], []
-        for frame in begin.unbind(1):
-            motion, state = network.advance_frame(frame, state)
-            singly.append(motion)
+        state, singly = network.initial_state(len(inputs)), []
+        with _keep_random_state(inputs):
+            together, _ = network.advance_frames(begin, state)
+            for frame in begin.unbind(1):
+                motion, state = network.advance_frame(frame, state)
+                singly.append(motion)
         if not torch.allclose(together, torch.stack(singly, 1), atol=1e-3):
             return 1
     return network.frames_per_call
@@ -159,6 +161,10 @@ def predict(network: MotionModel, clips: Sequence[Tensor], mode: str, batch: int
     return [motion for group in groups for motion in MODE_FUNCTIONS[mode](network, group)]
 
 
+def _keep_random_state(like: Tensor) -> AbstractContextManager[None]:
+    return torch.random.fork_rng([like.device] if like.is_cuda else [])
+
+
 @torch.no_grad()
 def mixes_clips(network: MotionModel, clips: Sequence[Tensor]) -> bool:
     """Return whether the motion of the first of clips (N, 252) depends on the clip beside it in a batch."""
@@ -168,7 +174,7 @@ def mixes_clips(network: MotionModel, clips: Sequence[Tensor]) -> bool:
     first, second = (clip[-count:, :SPARSE_DIM] for clip in clips[:2])
     motions = []
     for other in (first, second):
-        with torch.random.fork_rng([first.device] if first.is_cuda else []):  # both draw the same numbers
+        with _keep_random_state(first):  # both draw the same numbers
             state = network.initial_state(2)
             for frame in torch.stack([first, other]).split(1, 1):
                 motion, state = network.advance(frame, state, 1)

@@ -75,10 +75,11 @@ class MixesClips(WindowlessModel):
         return (sparse - sparse.mean(0)).repeat(1, 1, 4)[..., :198], state
 
 
-def test_a_network_that_mixes_clips_gets_one_at_a_time():
+def test_a_network_that_mixes_clips_gets_one_at_a_time_and_the_checks_draw_no_random_numbers():
     model = MixesClips(tiny.normalizer(), 7)
     assert all(motion.abs().max() < 1e-6 for motion in predict(model, CLIPS, "stream", 4))
     sampled = tiny.model(blend="sampled").double()
     before = torch.get_rng_state()
     assert not mixes_clips(sampled, CLIPS)
+    assert count_frames_per_call(sampled, CLIPS[0][None, :, :54]) == 1
     assert torch.equal(torch.get_rng_state(), before)
