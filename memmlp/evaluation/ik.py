@@ -23,6 +23,8 @@ from memmlp.motion.geometry import (
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.limb_solver import bend_arms_to_trackers, use_tracker_rotations
 
+CPU_CHUNK = 1024  # frames
+
 Objective = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps variables (n, D) and their rows (n,) to values (n,) and gradients (n, D)."""
 
@@ -50,11 +52,11 @@ class LBFGS:
 
     Attributes:
         iterations: maximum number of iterations.
-        chunk: number of frames that are solved together.
+        chunk: maximum number of frames that are solved together; on a CPU, fewer are faster.
     """
 
     iterations: int = 15
-    chunk: int = 1024
+    chunk: int = 4096
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
         """Return {"combined": motion}: the motion (N, 198) with the best-fitting rotations.
@@ -64,7 +66,8 @@ class LBFGS:
             motion: predicted motion (N, 198), world.
             sparse: inputs (N, 54), world.
         """
-        parts = zip(motion.split(self.chunk), sparse.split(self.chunk), strict=True)
+        chunk = self.chunk if motion.is_cuda else min(self.chunk, CPU_CHUNK)
+        parts = zip(motion.split(chunk), sparse.split(chunk), strict=True)
         rotations = torch.cat([self.solve(normalizer, *part) for part in parts])
         return {"combined": torch.cat([rotations, motion[:, POSITION]], -1)}
 
@@ -218,6 +221,7 @@ HALVINGS = 10  # number of step lengths to try; each is half of the previous one
 CURVATURE = 1e-12  # rows with a smaller x @ gradient / gradient**2 (see Curvature) are not used
 
 
+@torch.no_grad()
 def minimise(objective: Objective, x: Tensor, iterations: int, history: int = 10) -> Tensor:
     """Run L-BFGS (Nocedal and Wright, Algorithm 7.4) on each row of x (N, D) separately.
 

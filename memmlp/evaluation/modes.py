@@ -43,20 +43,24 @@ from memmlp.motion.geometry import (
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 
-CHECKED_FRAMES = 8  # frames at the start of a stream that are computed both together and one by one
-MAX_WINDOWS = 64  # in a call with fewer clips
+CHECKED_FRAMES = 8  # frames of a stream that are computed both together and one by one
+MAX_WINDOWS = 16  # in a call of a stream's evaluation; with more clips, one for each clip
 MIXED_FRAMES = 4  # frames at the end of two clips that are computed both together and beside a copy
 
 
-def predict_stream(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Predict the world motion (N, 198) of clips (N, 252) frame by frame."""
-    return predict_frame_by_frame(network, clips, 1)
+def predict_stream(
+    network: MotionModel, clips: Sequence[Tensor], max_windows: int = MAX_WINDOWS
+) -> list[Tensor]:
+    """Predict the world motion (N, 198) of clips (N, 252) frame by frame, as `predict_frame_by_frame`."""
+    return predict_frame_by_frame(network, clips, 1, max_windows)
 
 
-def predict_windows(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
+def predict_windows(
+    network: MotionModel, clips: Sequence[Tensor], max_windows: int = MAX_WINDOWS
+) -> list[Tensor]:
     """Predict the world motion (N, 198) of clips (N, 252) in non-overlapping windows."""
     if network.windowless:
-        return predict_stream(network, clips)
+        return predict_stream(network, clips, max_windows)
     if network.takes_whole_clip:
         return predict_clip_by_clip(network, clips)
     if 0 < network.shift < network.frames:
@@ -65,18 +69,24 @@ def predict_windows(network: MotionModel, clips: Sequence[Tensor]) -> list[Tenso
 
 
 @torch.no_grad()
-def predict_frame_by_frame(network: MotionModel, clips: Sequence[Tensor], size: int) -> list[Tensor]:
+def predict_frame_by_frame(
+    network: MotionModel, clips: Sequence[Tensor], size: int, max_windows: int = MAX_WINDOWS
+) -> list[Tensor]:
     """Predict the motion (N, 198) of clips (N, 252). Each network call gets one new frame.
 
     The last call in each window of `size` frames gives the motion for the whole window. The last window of a
     clip may be shorter. With `size` 1, this is a live stream. It may have several frames in a call if that
-    gives the same motion (`MotionModel.advance_frames`).
+    gives the same motion (`MotionModel.advance_frames`), but of a network with windows at most `max_windows`,
+    or one for each clip.
     """
     order, lengths, inputs = _sort_and_pad(clips)
-    most = count_frames_per_call(network, inputs) if size == 1 else 1
+    calls = _plan_calls(lengths, network.frames_per_call if size == 1 else 1, network.windowless, max_windows)
+    most = max(end - t for t, end in calls)
+    if most > 1 and not can_join_frames(network, inputs, min(most, CHECKED_FRAMES)):
+        calls = _plan_calls(lengths, 1, network.windowless, max_windows)
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
-    for t, end in progress_bar(_plan_calls(lengths, most, network.windowless), "stream", unit="calls"):
+    for t, end in progress_bar(calls, "stream", unit="calls"):
         active = sum(length > t for length in lengths)  # sorted by length, so the last ones end first
         state = {name: tensor[:active] for name, tensor in state.items()}
         if size == 1:
@@ -88,32 +98,31 @@ def predict_frame_by_frame(network: MotionModel, clips: Sequence[Tensor], size: 
     return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
 
 
-def _plan_calls(lengths: Sequence[int], most: int, windowless: bool) -> list[tuple[int, int]]:
-    """Return each call's first frame and end, for at most `most` frames per call. With a window per frame, a
-    call has at most MAX_WINDOWS windows, unless it has more clips."""
+def _plan_calls(
+    lengths: Sequence[int], most: int, windowless: bool, max_windows: int
+) -> list[tuple[int, int]]:
+    """Return the first frame and the end of each call, with at most `most` frames."""
     calls, t = [], 0
     while t < lengths[0]:
         active = sum(length > t for length in lengths)
-        count = most if windowless else max(1, min(most, MAX_WINDOWS // active))
+        count = most if windowless else max(1, min(most, max_windows // active))
         calls.append((t, min(t + count, lengths[0])))
         t += count
     return calls
 
 
 @torch.no_grad()
-def count_frames_per_call(network: MotionModel, inputs: Tensor) -> int:
-    """Return `network.frames_per_call`, or 1 if the first of inputs (B, N, 54) depend on later ones."""
-    if network.frames_per_call > 1:
-        begin = inputs[:, : min(CHECKED_FRAMES, network.frames_per_call)]
-        state, singly = network.initial_state(len(inputs)), []
-        with _keep_random_state(inputs):
-            together, _ = network.advance_frames(begin, state)
-            for frame in begin.unbind(1):
-                motion, state = network.advance_frame(frame, state)
-                singly.append(motion)
-        if not torch.allclose(together, torch.stack(singly, 1), atol=1e-3):
-            return 1
-    return network.frames_per_call
+def can_join_frames(network: MotionModel, inputs: Tensor, count: int) -> bool:
+    """Return whether `count` frames of the first of inputs (B, N, 54) give the same motion in one call as one
+    by one. They are far apart, so they differ even if a person first stands still."""
+    begin = inputs[:1, :: max(1, inputs.shape[1] // count)][:, :count]
+    state, singly = network.initial_state(1), []
+    with _keep_random_state(inputs):
+        together, _ = network.advance_frames(begin, state)
+        for frame in begin.unbind(1):
+            motion, state = network.advance_frame(frame, state)
+            singly.append(motion)
+    return torch.allclose(together, torch.stack(singly, 1), atol=1e-3)
 
 
 @torch.no_grad()
@@ -147,18 +156,18 @@ def predict_clip_by_clip(network: MotionModel, clips: Sequence[Tensor]) -> list[
     return [motion[-len(clip) :] for motion, clip in zip(motions, clips, strict=True)]
 
 
-MODE_FUNCTIONS: dict[str, Callable[[MotionModel, Sequence[Tensor]], list[Tensor]]] = {
+MODE_FUNCTIONS: dict[str, Callable[..., list[Tensor]]] = {
     "window": predict_windows,
     "stream": predict_stream,
 }
 
 
 def predict(network: MotionModel, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
-    """Predict the motion (N, 198) of each clip (N, 252), with at most `batch` clips in parallel. If a network
-    mixes the clips of a batch, it gets one clip at a time."""
+    """Predict the motion (N, 198) of each clip (N, 252), with at most `batch` clips or windows in a call. If
+    a network mixes the clips of a batch, it gets one clip at a time."""
     size = 1 if batch > 1 and mixes_clips(network, clips) else batch
     groups = [clips[i : i + size] for i in range(0, len(clips), size)]
-    return [motion for group in groups for motion in MODE_FUNCTIONS[mode](network, group)]
+    return [motion for group in groups for motion in MODE_FUNCTIONS[mode](network, group, size)]
 
 
 def _keep_random_state(like: Tensor) -> AbstractContextManager[None]:

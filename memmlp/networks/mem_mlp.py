@@ -244,7 +244,6 @@ class MemMLP(MotionModel):
         self.blocks = nn.ModuleList(memory.make_block(layer) for layer in range(1, depth + 1))
         self.predictor = predictor
         self.branches = predictor.branches
-        self.frames_per_call = memory.frames_per_call
 
     @classmethod
     def assemble(
@@ -274,6 +273,11 @@ class MemMLP(MotionModel):
     def past_frames(self) -> int:
         """The number of past input frames that the memory needs in the buffer."""
         return self.memory.past_frames
+
+    @property
+    def frames_per_call(self) -> int:  # type: ignore[override]
+        """The maximum number of new frames in a call of `advance_frames`."""
+        return self.memory.frames_per_call
 
     def count_past(self, new: int) -> int:
         """Return how many past frames a call with this many new frames depends on."""

@@ -132,6 +132,7 @@ class Memory(nn.Module):
         settled: whether a frame's recalled values never change, so that a stream may compute them once. A
             custom memory must set it to be exported as a streaming graph.
         frames_per_call: maximum number of new frames that can be computed at once, each with its own window.
+            A memory with its own `recall` or `remember` has 1 by default.
         streaming_recall: the class that computes the blocks' contributions in a streaming graph.
     """
 
@@ -139,6 +140,11 @@ class Memory(nn.Module):
 
     settled: bool = False
     frames_per_call: int = 1
+
+    def __init_subclass__(cls, **arguments: Any):
+        super().__init_subclass__(**arguments)
+        if {"recall", "remember"} & vars(cls).keys():
+            cls.frames_per_call = vars(cls).get("frames_per_call", 1)
 
     def __init__(self, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
         super().__init__()

@@ -53,7 +53,8 @@ class MotionModel(nn.Module):
         settled: whether the recalled values of a past frame never change, so that a live stream may keep
             them.
         windowless: whether both evaluation modes run the network as a stream; see WindowlessModel.
-        frames_per_call: maximum number of new frames in a call of `advance_frames`.
+        frames_per_call: maximum number of new frames in a call of `advance_frames`. A network with a window
+            that has its own `advance` has 1 by default.
         is_stream: whether the network needs no future frames. If not, only window mode can evaluate it.
         takes_whole_clip: whether window mode passes a whole clip to `predict_clip`, which may overlap
             windows.
@@ -68,6 +69,11 @@ class MotionModel(nn.Module):
     takes_whole_clip: bool = False
     origin: str = ""
     graph: ClassVar[type[StreamingGraph] | None] = None
+
+    def __init_subclass__(cls, **arguments: Any):
+        super().__init_subclass__(**arguments)
+        if "advance" in vars(cls) and not cls.windowless:  # a frame may depend on the others of its call
+            cls.frames_per_call = vars(cls).get("frames_per_call", 1)
 
     def __init__(self, normalizer: Normalizer, frames: int):
         super().__init__()
@@ -138,14 +144,16 @@ class MotionModel(nn.Module):
     def advance_frames(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Process n new frames (B, n, 54) at once like n calls of `advance_frame`, up to rounding; return
         their motion (B, n, 198) in the world, and the new state."""
-        return self.advance(sparse, state, sparse.shape[1])
+        motion, state = self.advance(sparse, state, sparse.shape[1])
+        return motion[:, -sparse.shape[1] :], state
 
     def advance_windows(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Compute `advance_frames` with a window for each new frame, if the state consists of the last frames
         of some sequences, and a frame does not depend on the n frames before it except through its inputs."""
         size, count = sparse.shape[:2]
         if count == 1:
-            return self.advance(sparse, state, 1)
+            motion, state = self.advance(sparse, state, 1)
+            return motion[:, -1:], state
         inputs, kept = self.append_inputs(sparse, state)
         others = {name: tensor for name, tensor in state.items() if name not in kept}
         windows = slide(inputs, self.past_frames, count)
@@ -154,9 +162,9 @@ class MotionModel(nn.Module):
         }
         motion, after = self.advance(sparse.flatten(0, 1)[:, None], self.running_state(windows) | later, 1)
         for name, tensor in others.items():
-            made = after[name][:, -1].unflatten(0, (size, count))
+            made = torch.unflatten(after[name][:, -1], 0, (size, count))
             kept[name] = torch.cat([tensor, made], 1)[:, count:]
-        return motion[:, -1].unflatten(0, (size, count)), kept
+        return torch.unflatten(motion[:, -1], 0, (size, count)), kept
 
     def predict_clip(self, sparse: Tensor) -> Tensor:
         """Map a clip's world inputs (N, 54), N >= T, to its world motion (N, 198); see `takes_whole_clip`."""

@@ -229,7 +229,11 @@ class OwnPastMemory(FeatureMemory):
         self.settled = self.history == "first"
         self.shift = {"frame": 1, "window": self.frames}[settings.shift]
         self.past_frames = self.frames + self.shift - 1
-        self.frames_per_call = self.shift if self.settled else 1
+
+    @property
+    def frames_per_call(self) -> int:  # type: ignore[override]
+        """The maximum number of new frames whose recalled past ends before them."""
+        return self.shift if self.settled else 1
 
     def count_past(self, new: int) -> int:
         return self.frames + max(self.shift - new, 0)
