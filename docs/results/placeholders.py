@@ -5,13 +5,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
-from docs.results.frontiers import find_cost
 from docs.results.table_page import BRANCHES, KeptTable, make_markdown_table
 from memmlp.common.errors import InputError
 from memmlp.common.text_formats import escape_markdown
-from memmlp.report.tables.flags import join_first
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table import Row, Table
+from memmlp.report.tables.table import Table
 from memmlp.report.tables.table_text import (
     CONFOUNDED,
     MISSING,
@@ -118,25 +116,11 @@ class Placeholders:
         heads = ["page", "runs", "seeds", "significant differences", "the same with contents joined"]
         return make_markdown_table(heads, lines)
 
-    def leaders(self, names: Sequence[str], metric: str, cost: str, mode: str = "stream") -> str:
-        """Return the variants of some tables that no other one beats in both a metric and a cost. Variants
-        with one seed do not count in a table where others have more."""
-        known = []
-        for row in (row for name in names for row in _select_repeated(self._find_table(name))):
-            price = find_cost(row, mode, cost)
-            if price is not None and (mean := row.cells[mode][metric].mean) is not None:
-                known.append((price, mean, row))
-        best, texts = float("inf"), []
-        for price, mean, row in sorted(known, key=lambda one: one[:2]):
-            if mean < best:
-                best, cell = mean, row.cells[mode][metric]
-                number = f"{format_mean(cell, metric)} {find_unit(metric)}"
-                texts.append(f"'{row.label}' {number} ({price:.2g})")
-        return escape_markdown(join_first(texts))
-
     def lowest(self, name: str, *metrics: str, mode: str = "stream") -> str:
-        """Return the variant with the lowest error of a table, for each metric; of those in `leaders`."""
-        texts, rows = [], _select_repeated(self._find_table(name))
+        """Return the variant with the lowest error of a table, for each metric. Variants with one seed do not
+        count in a table where others have more."""
+        texts, table = [], self._find_table(name)
+        rows = [row for row in table.rows if len(row.found) > 1] or table.rows
         for metric in metrics:
             cells = [(row.cells[mode][metric], row.label) for row in rows]
             cell, label = min(
@@ -144,18 +128,6 @@ class Placeholders:
             )
             texts.append(f"{metric} {format_mean(cell, metric)} {find_unit(metric)} ('{label}')")
         return escape_markdown(", ".join(texts))
-
-    def agreement(self, name: str, metric: str, mode: str = "stream") -> str:
-        """Return, for each variant with several seeds, in how many groups of clips its error is higher than
-        its control's."""
-        table = self._find_table(name)
-        repeated = [row.label for row in _select_repeated(table)]
-        found = [
-            f"'{row.label}' {effect.groups_above} of {effect.groups}"
-            for row, one, _, effect in table.list_effects(mode)
-            if one == metric and row.label in repeated
-        ]
-        return escape_markdown(join_first(found))
 
     def searches(self, trials: int, tflop: float) -> str:
         """Return a table of a search at equal compute, with the best of the first random trials and the trial
@@ -219,8 +191,3 @@ class Placeholders:
         if key not in self._regrouped:
             self._regrouped[key] = regroup(patterns, weigh_groups)
         return self._regrouped[key]
-
-
-def _select_repeated(table: Table) -> list[Row]:
-    several = [row for row in table.rows if len(row.found) > 1]
-    return several or list(table.rows)

@@ -55,7 +55,7 @@ def show_clip(folder: Path, began: float) -> None:
     card, path = read_card(DEFAULT), folder / "clip.svg"
     piece = predict_shipped_clip(card["title"])
     write_picture(path, piece, 5)
-    click.echo(f"1. {card['title']} on {piece.title}: a real recording of a person who is in no training")
+    click.echo(f"1. {card['title']} on {piece.title}: a real recording of a person not in the training data")
     click.echo(f"   mean error of the 22 joints: {piece.errors[card['title']].mean():.1f} cm")
     click.echo(f"   picture, after {time.monotonic() - began:.0f} s: {path}")
     click.echo("   see it move: memmlp live")

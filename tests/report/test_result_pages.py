@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from docs.results.make_pages import make_pages
@@ -111,27 +110,13 @@ def test_significant_effects_without_a_sign_in_the_paper_are_listed(sweep: Sweep
         assert sum(text.count(metric) for metric in set(metrics)) == len(metrics)
 
 
-def test_leaders_are_beaten_by_no_variant_in_both(sweep: Sweep, kept: KeptResults):
+def test_the_lowest_error_is_of_a_variant_with_several_seeds(sweep: Sweep, kept: KeptResults):
     made = source(sweep, kept)
-    errors = [row.cells["stream"]["MPJPE"].mean for row in made.table.rows]
-    costs = np.argsort(np.argsort(errors)[::-1]) + 1.0  # the larger the error, the smaller the cost
-    costs[1] = 9  # the largest cost
-    rows = [replace(row, costs={"ms": cost}) for row, cost in zip(made.table.rows, costs, strict=True)]
-    made = made._replace(table=replace(made.table, rows=tuple(rows)))
-    text = fill('{{ leaders(["t"], "MPJPE", "ms") }}', made)
-    better = [
-        all(one == two or errors[two] > errors[one] or costs[two] > costs[one] for two in range(len(rows)))
-        for one in range(len(rows))
-    ]
-    assert 1 < sum(better) < len(rows)
-    assert [f"({cost:.2g})" in text for cost in costs] == better
-    assert fill('{{ leaders(["t", "t"], "MPJPE", "ms") }}', made) == text
-    assert f"('{rows[np.argmin(errors)].label}')" in fill('{{ lowest("t", "MPJPE") }}', made)
-    label, effect = next(
-        (row.label, e) for row, metric, _, e in made.table.list_effects("stream") if metric == "MPJPE"
-    )
-    text = fill('{{ agreement("t", "MPJPE") }}', made)
-    assert f"'{label}' {effect.groups_above} of {effect.groups}" in text.replace("\\", "")
+    rows = sorted(made.table.rows, key=lambda row: row.cells["stream"]["MPJPE"].mean)
+    assert f"('{rows[0].label}')" in fill('{{ lowest("t", "MPJPE") }}', made)
+    once = (replace(rows[0], found=rows[0].found[:1]), *rows[1:])
+    made = made._replace(table=replace(made.table, rows=once))
+    assert f"('{rows[1].label}')" in fill('{{ lowest("t", "MPJPE") }}', made)
 
 
 def test_a_mean_over_more_clips_than_the_controls_has_the_shared_clips_beside_it(sweep, kept):
