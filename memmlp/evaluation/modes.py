@@ -72,22 +72,20 @@ def predict_windows(
 def predict_frame_by_frame(
     network: MotionModel, clips: Sequence[Tensor], size: int, max_windows: int = MAX_WINDOWS
 ) -> list[Tensor]:
-    """Predict the motion (N, 198) of clips (N, 252). Each network call gets one new frame.
+    """Predict the motion (N, 198) of clips (N, 252) frame by frame.
 
-    The last call in each window of `size` frames gives the motion for the whole window. The last window of a
-    clip may be shorter. With `size` 1, this is a live stream. It may have several frames in a call if that
-    gives the same motion (`MotionModel.advance_frames`), but of a network with windows at most `max_windows`,
-    or one for each clip.
+    The last frame of each `size` frames gives the motion for all of them; a clip's last ones may be fewer. With
+    `size` 1, this is a live stream. A network call then computes several frames if that gives the same motion
+    (`MotionModel.advance_frames`): with windows at most `max_windows` for all clips, or one for each clip.
     """
     order, lengths, inputs = _sort_and_pad(clips)
     calls = _plan_calls(lengths, network.frames_per_call if size == 1 else 1, network.windowless, max_windows)
-    most = max(end - t for t, end in calls)
+    most = max(end - t for t, end, _ in calls)
     if most > 1 and not can_join_frames(network, inputs, min(most, CHECKED_FRAMES)):
         calls = _plan_calls(lengths, 1, network.windowless, max_windows)
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
-    for t, end in progress_bar(calls, "stream", unit="calls"):
-        active = sum(length > t for length in lengths)  # sorted by length, so the last ones end first
+    for t, end, active in progress_bar(calls, "stream", unit="calls"):
         state = {name: tensor[:active] for name, tensor in state.items()}
         if size == 1:
             motion[:active, t:end], state = network.advance_frames(inputs[:active, t:end], state)
@@ -100,13 +98,13 @@ def predict_frame_by_frame(
 
 def _plan_calls(
     lengths: Sequence[int], most: int, windowless: bool, max_windows: int
-) -> list[tuple[int, int]]:
-    """Return the first frame and the end of each call, with at most `most` frames."""
+) -> list[tuple[int, int, int]]:
+    """Return the first frame, the end and the number of clips of each call, with at most `most` frames."""
     calls, t = [], 0
     while t < lengths[0]:
-        active = sum(length > t for length in lengths)
+        active = sum(length > t for length in lengths)  # sorted by length, so the last ones end first
         count = most if windowless else max(1, min(most, max_windows // active))
-        calls.append((t, min(t + count, lengths[0])))
+        calls.append((t, min(t + count, lengths[0]), active))
         t += count
     return calls
 
