@@ -74,8 +74,8 @@ def predict_frame_by_frame(
 ) -> list[Tensor]:
     """Predict the motion (N, 198) of clips (N, 252) frame by frame.
 
-    The last frame of each `size` frames gives the motion for all of them; a clip's last ones may be fewer. With
-    `size` 1, this is a live stream. A network call then computes several frames if that gives the same motion
+    The last frame of each `size` frames gives the motion for all of them; a clip's last ones may be fewer.
+    With `size` 1, this is a live stream. A network call then computes several frames if that gives the same motion
     (`MotionModel.advance_frames`): with windows at most `max_windows` for all clips, or one for each clip.
     """
     order, lengths, inputs = _sort_and_pad(clips)
