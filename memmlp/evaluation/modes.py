@@ -75,8 +75,8 @@ def predict_frame_by_frame(
     """Predict the motion (N, 198) of clips (N, 252) frame by frame.
 
     The last frame of each `size` frames gives the motion for all of them; a clip's last ones may be fewer.
-    With `size` 1, this is a live stream. A network call then computes several frames if that gives the same motion
-    (`MotionModel.advance_frames`): with windows at most `max_windows` for all clips, or one for each clip.
+    With `size` 1, this is a live stream. A network call then computes several frames if that gives the same
+    motion (`MotionModel.advance_frames`): with windows at most `max_windows` for all clips, or one for each.
     """
     order, lengths, inputs = _sort_and_pad(clips)
     calls = _plan_calls(lengths, network.frames_per_call if size == 1 else 1, network.windowless, max_windows)
