@@ -61,7 +61,8 @@ def compute_process_namespace() -> str:
 
 def current_process() -> dict[str, Any]:
     """Describe this process; other processes can pass the description to `is_alive`."""
-    return {"pid": os.getpid(), "born": _read_start_time(os.getpid()), "place": compute_process_namespace()}
+    _, born = _read_state_and_start(os.getpid())
+    return {"pid": os.getpid(), "born": born, "place": compute_process_namespace()}
 
 
 def is_alive(process: Mapping[str, Any]) -> bool | None:
@@ -77,19 +78,15 @@ def is_alive(process: Mapping[str, Any]) -> bool | None:
         return False
     except PermissionError:  # the process belongs to another user
         pass
-    ended = _read_process_fields(pid)[:1] in [[state] for state in ENDED]
-    return not ended and _read_start_time(pid) == process.get("born")
+    state, born = _read_state_and_start(pid)
+    return state not in ENDED and born == process.get("born")
 
 
-def _read_start_time(pid: int) -> str | None:
-    """Return the start time of a process in kernel ticks; it tells processes with the same pid apart."""
-    fields = _read_process_fields(pid)
-    return fields[19] if len(fields) > 19 else None
-
-
-def _read_process_fields(pid: int) -> list[str]:
-    """Return the fields of /proc/PID/stat from the process state on; empty without /proc."""
-    return _read_text(PROC / str(pid) / "stat").rpartition(")")[2].split()
+def _read_state_and_start(pid: int) -> tuple[str, str] | tuple[None, None]:
+    """Return the state of a process, and its start time in kernel ticks, which tells processes with the same
+    pid apart; None without /proc."""
+    fields = _read_text(PROC / str(pid) / "stat").rpartition(")")[2].split()
+    return (fields[0], fields[19]) if fields else (None, None)
 
 
 def _read_text(path: Path) -> str:
@@ -139,13 +136,9 @@ class Claim(NamedTuple):
             return owner if isinstance(owner, dict) and not self.free else None
         return None
 
-    def can_be_taken_over(self, idle: float) -> bool | None:
-        """Return whether another process may claim the folder after `idle` seconds; None if it must wait for
-        LEASE."""
-        alive = is_alive(self.owner) if self.owner else None
-        if self.free or alive is False or idle > LEASE:
-            return True
-        return None if alive is None else False
+    def can_be_taken_over(self, idle: float) -> bool:
+        """Return whether another process may claim the folder after `idle` seconds."""
+        return self.free or idle > LEASE or (self.owner is not None and is_alive(self.owner) is False)
 
 
 class Lock:
