@@ -39,18 +39,13 @@ Errors = dict[str, Number | None]
 Word = str | int | None
 
 
-def _record(*bases: Any, **fields: Any) -> Any:
-    """Make a TypedDict with these fields, which may be missing, and the fields of its bases."""
-    return _make_typed_dict(bases, fields, total=False)
-
-
-def _complete_record(*bases: Any, **fields: Any) -> Any:
-    return _make_typed_dict(bases, fields, total=True)
-
-
-def _make_typed_dict(bases: tuple[Any, ...], fields: dict[str, Any], total: bool) -> Any:
+def _record(*bases: Any, total: Any = False, **fields: Any) -> Any:
+    """Make a TypedDict with these fields and those of its bases. New fields may be missing unless `total`."""
     content = {"__annotations__": fields, "__module__": __name__}
     return types.new_class("Record", bases or (TypedDict,), {"total": total}, lambda own: own.update(content))
+
+
+_complete_record = functools.partial(_record, total=True)
 
 
 # Code and machine
