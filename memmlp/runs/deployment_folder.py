@@ -66,11 +66,6 @@ class DeploymentFolder:
         return records.read(self.latency, records.Deployment)
 
     @property
-    def creation_time(self) -> str:
-        """The time of `finish`, UTC in ISO 8601; empty before it."""
-        return str(self.record.get("made", ""))
-
-    @property
     def settings(self) -> dict[str, Any]:
         """The requested settings of the deployment; empty before `finish`."""
         return dict(self.record.get("settings", {}))

@@ -128,14 +128,9 @@ class Run:
             config,
             lambda one: (
                 one.is_current, bool(one.accurate_int8_file),
-                not describe_export_difference(one.settings, config), one.creation_time,
+                not describe_export_difference(one.settings, config), one.record.get("made", ""),
             ),
         )  # fmt: skip
-
-    @property
-    def deployment_as_configured(self) -> DeploymentFolder:
-        """The deployment that tables show for the run's own config (`find_shown_deployment`)."""
-        return self.find_shown_deployment(self.config)
 
     def find_shown_deployment(self, config: Mapping[str, Any]) -> DeploymentFolder:
         """Return the deployment with the measurements for tables, given the run's config. The order of
@@ -146,7 +141,7 @@ class Run:
             config,
             lambda one: (
                 not describe_export_difference(one.settings, config), one.is_current,
-                one.settings == requested, one.creation_time,
+                one.settings == requested, one.record.get("made", ""),
             ),
         )  # fmt: skip
 

@@ -145,7 +145,7 @@ def list_result_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
 def _list_origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
     a, b = (
         flatten({key: run.manifest.get(key) for key in ORIGIN_KEYS})
-        | {"latency": describe_timing_machine(run.deployment_as_configured.record)}
+        | {"latency": describe_timing_machine(run.find_shown_deployment(run.config).record)}
         | list_outdated_results(run)
         for run in (first, second)
     )

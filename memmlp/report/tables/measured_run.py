@@ -271,7 +271,7 @@ def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> Meas
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
             sources |= {clip["name"]: clip["source"]} if clip.get("source") else {}
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
-    deployed = (deployments or [run.deployment_as_configured])[-1]
+    deployed = (deployments or [run.find_shown_deployment(run.config)])[-1]
     latency = deployed.record
     origin = _add_evaluations(_join_prerequisite_origins(_read_origin(manifest), run), reports)
     origin = replace(origin, deployed=find_deployed_precision(latency))

@@ -166,7 +166,7 @@ def _list_marks(run: Run) -> dict[str, str]:
     if not is_trained(run):
         return {}
     marks = {"errors": warn_if_hardly_trained(count_training_frames(run))}
-    record = select_deployed_measurements(run.deployment_as_configured.record)
+    record = select_deployed_measurements(run.find_shown_deployment(run.config).record)
     shares = [record[key] for key in CORE_FRACTION_KEYS.values() if key in record]
     if shares and min(shares) < MIN_CORE_FRACTION:
         marks["latency"] = f"timed on a busy machine: a core was free {min(shares):.0%} of the time"

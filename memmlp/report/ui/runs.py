@@ -245,7 +245,7 @@ def _read_end(path: Path) -> str:
 
 def _read_latency(run: Run) -> dict[str, Any]:
     try:
-        record = select_deployed_measurements(run.deployment_as_configured.record)
+        record = select_deployed_measurements(run.find_shown_deployment(run.config).record)
     except InputError:
         return {}
     return {key: value for key, value in flatten(record).items() if isinstance(value, int | float | str)}
