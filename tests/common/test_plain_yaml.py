@@ -12,6 +12,9 @@ def test_values_are_those_of_the_command_line():
     assert content["b"] == [0.001, 5, -0.5, True, None, None]
     with pytest.raises(yaml.YAMLError, match="nested too deeply"):
         parse_config_yaml("[" * 5000)
+    for text in ("{[a]: 1}", "{{}: 1}"):
+        with pytest.raises(yaml.YAMLError, match="unhashable key"):
+            parse_config_yaml(text)
 
 
 def test_labels_are_text_as_written():
