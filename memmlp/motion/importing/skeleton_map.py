@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from memmlp.common.errors import InputError, describe_read_error
-from memmlp.common.schema import SafeLoader, load_yaml
+from memmlp.common.schema import parse_config_yaml
 from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.formats.recording import END, Recording
 
@@ -61,7 +61,7 @@ def load_skeleton(which: str) -> SkeletonMap:
         names = ", ".join(list_shipped_skeletons())
         raise InputError(f"--skeleton {which}: must be one of {names}, or the path of a YAML map")
     try:
-        content = load_yaml(path.read_text("utf-8"), _StrictLoader)
+        content = parse_config_yaml(path.read_text("utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
         reason = describe_read_error(error)[:120]
         raise InputError(f"{path}: {reason}; expected a readable YAML map") from error
@@ -153,16 +153,6 @@ def _normalize_name(name: str) -> str:
 
 
 # The YAML file
-
-
-class _StrictLoader(SafeLoader):
-    """A YAML loader that raises ValueError for repeated keys."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        if twice := [key for key, count in keys.items() if count > 1]:
-            raise ValueError(f"the key {twice[0]!r} occurs twice")
-        return super().construct_mapping(node, deep)
 
 
 def _parse_map(path: Path, content: object) -> SkeletonMap:
