@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import memmlp
-from memmlp.common.lease import publish, temporary_path
+from memmlp.common.lease import publish_at_end
 
 
 def find_packaged_folder(name: str) -> Path:
@@ -60,17 +60,10 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing under a temporary name; it is synced and renamed once it is complete, even if
     the machine crashes. Raises LeaseLost if this process lost its lease of the file's folder."""
-    unfinished = temporary_path(path)
-    try:
-        with naming_file(path), open(unfinished, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        publish(unfinished, path)
-    except BaseException:
-        with contextlib.suppress(OSError):  # the disk may refuse this, too; the first error says why
-            unfinished.unlink(missing_ok=True)
-        raise
+    with publish_at_end(path) as unfinished, naming_file(path), open(unfinished, "wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
     sync_folder(path.parent)
 
 

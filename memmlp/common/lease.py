@@ -327,15 +327,31 @@ def publish(unfinished: Path, path: Path) -> None:
         raise
 
 
+@contextlib.contextmanager
+def publish_at_end(path: Path) -> Iterator[Path]:
+    """Yield a `temporary_path` for a file or folder: at the end of the context it is published (`publish`),
+    and after an error it is removed."""
+    unfinished = temporary_path(path)
+    try:
+        yield unfinished
+        publish(unfinished, path)
+    finally:
+        with contextlib.suppress(OSError):  # the disk may refuse this, too; the first error says why
+            _remove(unfinished)
+
+
 def _remove_unfinished(folder: Path, number: int) -> None:
     for path in [*folder.rglob(".*.lease-*.tmp"), *folder.parent.glob(f".{folder.name}.lease-*.tmp")]:
         owner = re.search(r"\.lease-(\d+)\.[0-9a-f]+\.tmp$", path.name)
-        if owner is None or int(owner[1]) >= number:  # of a later owner
-            continue
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+        if owner and int(owner[1]) < number:  # not of a later owner
+            _remove(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _find_lease(path: Path) -> Lease | None:

@@ -18,7 +18,7 @@ from torch.fx import config as fx_config
 
 from memmlp import __version__
 from memmlp.common.files import naming_file
-from memmlp.common.lease import publish, temporary_path
+from memmlp.common.lease import publish_at_end
 from memmlp.deploy.opsets import NATIVE, convert_opset
 from memmlp.deploy.parity import disable_sampling
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
@@ -83,13 +83,8 @@ def export_module(
         simplify(program.model)
     graph = convert_opset(program.model_proto, opset)
     onnx.helper.set_model_props(graph, meta)
-    unfinished = temporary_path(path)
-    try:
-        with naming_file(path):
-            onnx.save(graph, unfinished)
-        publish(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with publish_at_end(path) as unfinished, naming_file(path):
+        onnx.save(graph, unfinished)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, naming_file
-from memmlp.common.lease import publish, temporary_path
+from memmlp.common.lease import publish_at_end
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import GraphConstants
@@ -105,11 +105,11 @@ def _quantise_to_int8(
     such product with more scales). CPUs without VNNI add products in sixteen bits, and would overflow with
     eight-bit weights. Activations have eight bits and one scale, calibrated on streamed clips."""
     joined = [tensor.name for tensor in onnx.load(source).graph.initializer if len(tensor.dims) == 3]
-    unfinished, root = temporary_path(path), logging.getLogger()
+    root = logging.getLogger()
     level = root.level
     root.setLevel(logging.ERROR)  # hide the advice to prepare the graph; torch's exporter did it already
     try:
-        with naming_file(path), tempfile.TemporaryDirectory() as folder:
+        with publish_at_end(path) as unfinished, naming_file(path), tempfile.TemporaryDirectory() as folder:
             quantize_static(
                 shutil.copy(source, folder),  # it writes another file beside its source
                 unfinished,
@@ -132,10 +132,8 @@ def _quantise_to_int8(
             _check_quantised(model, inner)
             _correct_newest_frames(model, inner, corrected)
             onnx.save(model, unfinished)
-        publish(unfinished, path)
     finally:
         root.setLevel(level)
-        unfinished.unlink(missing_ok=True)
 
 
 def _check_quantised(model: ModelProto, inner: Collection[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.lease import Lock, publish, temporary_path
+from memmlp.common.lease import Lock, publish_at_end
 from memmlp.motion.clip import resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.cache import ClipFolder, compute_frame_blocks, load_finished_cache, prepare_cache
@@ -122,9 +121,5 @@ def _generate_once(root: Path, generate: Callable[[Path], object]) -> None:
     root.parent.mkdir(parents=True, exist_ok=True)
     with Lock(root.parent, root.name).hold():
         if not root.exists():  # another process may have generated it meanwhile
-            unfinished = temporary_path(root)
-            try:
+            with publish_at_end(root) as unfinished:
                 generate(unfinished)
-                publish(unfinished, root)
-            finally:
-                shutil.rmtree(unfinished, ignore_errors=True)

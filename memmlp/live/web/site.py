@@ -16,7 +16,7 @@ import numpy as np
 from memmlp import __version__
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest, naming_file, now, read_json
-from memmlp.common.lease import publish, temporary_path
+from memmlp.common.lease import publish_at_end, temporary_path
 from memmlp.common.npm import ONNXRUNTIME_WEB, read_package_files
 from memmlp.common.page_server import build_security_policy, read_page_file
 from memmlp.common.progress import announce
@@ -107,19 +107,15 @@ class Site:
         """Write the site atomically in place of an earlier one, and return its size in bytes. Raises
         InputError if the folder has other content, or ONNX Runtime cannot be downloaded."""
         check_site_folder(out)
-        unfinished = temporary_path(out)
-        try:
+        earlier = temporary_path(out)
+        with publish_at_end(out) as unfinished:
             unfinished.mkdir(parents=True)
             with naming_file(out):
                 self._write_contents(unfinished)
             total = sum(path.stat().st_size for path in unfinished.rglob("*") if path.is_file())
-            earlier = temporary_path(out)
             if out.exists():
                 out.rename(earlier)
-            publish(unfinished, out)
-            shutil.rmtree(earlier, ignore_errors=True)
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
+        shutil.rmtree(earlier, ignore_errors=True)
         return total
 
     def _write_contents(self, folder: Path) -> None:
