@@ -40,7 +40,7 @@ from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, find_option, select_training_config
-from memmlp.runs.loggers.logger import Loggers
+from memmlp.runs.loggers.logger import RunLogger
 from memmlp.runs.lookup import (
     check_trained,
     describe_kind,
@@ -125,12 +125,11 @@ def build_untrained(overrides: Sequence[str]) -> MotionModel:
     return architecture.build(normalizer, codes).eval()
 
 
-def build_loggers(cfg: DictConfig) -> Loggers:
+def build_loggers(cfg: DictConfig) -> tuple[RunLogger, ...]:
     """Build the loggers of a config, such as TensorBoard."""
     outputs = Path(cfg.paths.outputs)
     nodes = _convert_to_dict(cfg.loggers).items()
-    loggers = (find_component("loggers", name).build(node, outputs=outputs) for name, node in nodes)
-    return Loggers(tuple(loggers))
+    return tuple(find_component("loggers", name).build(node, outputs=outputs) for name, node in nodes)
 
 
 def build(cfg: DictConfig, slot: str) -> Any:

@@ -36,7 +36,7 @@ from memmlp.runs.identity import (
     select_deployment_settings,
     select_evaluation_settings,
 )
-from memmlp.runs.loggers.logger import Loggers
+from memmlp.runs.loggers.logger import RunLogger, show_run
 from memmlp.runs.run import Run
 from memmlp.training.devices import describe_device, describe_unused_gpu
 from memmlp.training.loop import ValidationCallback
@@ -66,7 +66,7 @@ class Experiment(RunRequest):
     training: NetworkTraining | RefinerTraining
     evaluation: Evaluation
     deployment: Deployment | None
-    loggers: Loggers
+    loggers: Sequence[RunLogger]
     make_name: Callable[[str, Mapping[str, Any]], str] = lambda kind, config: kind
     unrefined: Experiment | None = None
 
@@ -211,8 +211,8 @@ def record_outcome(experiment: Experiment, run: Run, again: bool = False) -> Ite
     bad input, interruptions, a full disk, a closed output pipe, or the loss of the run to another process."""
     missing = again or not run.done or not all(map(run.has, experiment.stage_ids))
     missing = missing or bool(list_missing_modes(experiment, run))
-    loggers = experiment.loggers if missing else Loggers()
-    with loggers.show_run(run), keep_announcements(run.log_path):
+    loggers = experiment.loggers if missing else ()
+    with show_run(run, loggers), keep_announcements(run.log_path):
         try:
             yield
         except (LeaseLost, BrokenPipeError):

@@ -18,7 +18,6 @@ from memmlp.config.compose import compose_config
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.motion.dataset import MotionDataset
 from memmlp.runs.identity import NEUTRAL
-from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
 from memmlp.training import loop
 from memmlp.training.compute import StepCompute
@@ -130,7 +129,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment.config["paths"]["outputs"] = str(folder)
     data = experiment.motion.prepare()
     identity = experiment.identity(data.digest)
-    codes = make_prerequisites(replace(experiment, loggers=Loggers()), data).model
+    codes = make_prerequisites(replace(experiment, loggers=()), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     experiment.training.train(TrainingJob(experiment.architecture, data, codes, run, experiment.device))

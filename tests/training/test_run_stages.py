@@ -28,7 +28,6 @@ from memmlp.report.tables.measured_run import load_measured_run
 from memmlp.runs import environment
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import VERSIONS
-from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled
@@ -170,7 +169,7 @@ def test_changed_weights_are_not_evaluated_and_what_is_exported_is_checked_on_th
 ])  # fmt: skip
 def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(tmp_path, error, failure):
     run = begun(tmp_path)
-    experiment: Any = SimpleNamespace(loggers=Loggers(), stage_ids=(), outputs=tmp_path)
+    experiment: Any = SimpleNamespace(loggers=(), stage_ids=(), outputs=tmp_path)
     if type(error) is RuntimeError:
         error.__context__ = KeyboardInterrupt()
     with pytest.raises(type(error)), record_outcome(experiment, run):

@@ -227,50 +227,41 @@ class Session:
             raise
 
 
-@dataclass(frozen=True)
-class Loggers:
-    loggers: tuple[RunLogger, ...] = ()
-
-    @contextlib.contextmanager
-    def show_run(self, run: Run) -> Iterator[None]:
-        """Show a run during the context, then its final state. A logger never stops the run: if it fails, a
-        warning goes to stderr; if it is slow, the run waits at its end for at most MAX_WAIT."""
-        ended = threading.Event()
-        threads: list[threading.Thread] = []
-        for logger in self.loggers:
-            arguments = (Session(logger, run), ended)
-            threads.append(threading.Thread(target=_show_until_end, args=arguments, daemon=True))
-            threads[-1].start()
-        try:
-            yield
-        finally:
-            ended.set()
-            latest = time.monotonic() + MAX_WAIT
-            for logger, thread in zip(self.loggers, threads, strict=True):
-                thread.join(max(latest - time.monotonic(), 0))
-                if thread.is_alive():
-                    _warn(f"run {run.id} is not shown in {logger.name}: the logger is too slow")
+@contextlib.contextmanager
+def show_run(run: Run, loggers: Sequence[RunLogger]) -> Iterator[None]:
+    """Show a run during the context, then its final state. A logger never stops the run: if it fails, a
+    warning goes to stderr; if it is slow, the run waits at its end for at most MAX_WAIT."""
+    ended = threading.Event()
+    arguments = [(Session(logger, run), ended) for logger in loggers]
+    threads = [threading.Thread(target=_show_until_end, args=one, daemon=True) for one in arguments]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        latest = time.monotonic() + MAX_WAIT
+        for logger, thread in zip(loggers, threads, strict=True):
+            thread.join(max(latest - time.monotonic(), 0))
+            if thread.is_alive():
+                _warn(f"run {run.id} is not shown in {logger.name}: the logger is too slow")
 
 
 def _show_until_end(session: Session, ended: threading.Event) -> None:
     """Show a run until its end. After a failure, warn once and try again with growing pauses."""
-    pause, failed = PACE, False
-
-    def attempt(action: Callable[[], None]) -> bool:
-        nonlocal failed
+    pause, failed, has_ended = 0.0, False, False
+    while not has_ended:
+        has_ended = ended.wait(pause)
         try:
-            action()
-            return True
+            if has_ended:
+                session.end()
+            else:
+                session.update()
+            pause = PACE
         except Exception as error:
             if not failed:
                 _warn(f"run {session.run.id} is not shown in {session.logger.name}: {_format_error(error)}")
-            failed = True
-            return False
-
-    attempt(session.update)
-    while not ended.wait(pause):
-        pause = PACE if attempt(session.update) else min(2 * pause, MAX_PAUSE)
-    attempt(session.end)
+            failed, pause = True, min(2 * pause or PACE, MAX_PAUSE)
 
 
 def _warn(line: str) -> None:

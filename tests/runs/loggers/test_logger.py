@@ -10,7 +10,7 @@ from processes import until
 
 from memmlp.common.files import write_json
 from memmlp.runs.loggers import logger as module
-from memmlp.runs.loggers.logger import Loggers, LogReader, Session, read_run_facts, sync_runs
+from memmlp.runs.loggers.logger import LogReader, RunLogger, Session, read_run_facts, show_run, sync_runs
 from memmlp.runs.lookup import add_tags
 from memmlp.runs.run import Run
 
@@ -21,20 +21,20 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_PAUSE", 0.02)
 
 
-def loggers_of(*servers: Server) -> Loggers:
-    return Loggers(tuple(FakeLogger(server, f"fake{n}") for n, server in enumerate(servers)))
+def loggers_of(*servers: Server) -> list[RunLogger]:
+    return [FakeLogger(server, f"fake{n}") for n, server in enumerate(servers)]
 
 
 def test_without_loggers_there_is_no_thread_and_no_file(tmp_path: Path):
     run, threads = a_run(tmp_path), threading.active_count()
-    with loggers_of().show_run(run):
+    with show_run(run, loggers_of()):
         assert threading.active_count() == threads
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
 def test_a_run_is_shown_while_it_goes_on_and_to_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run, server = a_run(tmp_path), Server()
-    with loggers_of(server).show_run(run):
+    with show_run(run, loggers_of(server)):
         until(lambda: server.values.get(run.id) == losses(3), "the curve so far")
         assert server.status[run.id] == "running"
         run.log(4, {"loss": 1 / 4})
@@ -47,9 +47,9 @@ def test_a_run_is_shown_while_it_goes_on_and_to_its_end(tmp_path: Path, capsys: 
 def test_a_failure_of_the_run_is_shown_and_a_run_that_never_began_is_not(tmp_path: Path):
     run, server = a_run(tmp_path), Server()
     run.fail("why")
-    with contextlib.suppress(KeyError), loggers_of(server).show_run(run):
+    with contextlib.suppress(KeyError), show_run(run, loggers_of(server)):
         raise KeyError
-    with loggers_of(server).show_run(Run.from_id(tmp_path, "1" * 16)):
+    with show_run(Run.from_id(tmp_path, "1" * 16), loggers_of(server)):
         pass
     assert server.status == {run.id: "failed"}
 
@@ -57,7 +57,7 @@ def test_a_failure_of_the_run_is_shown_and_a_run_that_never_began_is_not(tmp_pat
 def test_a_server_that_comes_back_has_everything_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Values whose receipt was lost are among them. The server of another logger stays down."""
     run, server = a_run(tmp_path), Server(drops=True)
-    with loggers_of(server, Server(down=True)).show_run(run):
+    with show_run(run, loggers_of(server, Server(down=True))):
         until(lambda: server.begun == 2 and server.values[run.id] == losses(3), "the curve, once")
         server.down = True
         run.log(4, {"loss": 1 / 4})
@@ -79,7 +79,7 @@ def test_a_logger_that_hangs_holds_up_neither_the_run_nor_another(tmp_path: Path
     monkeypatch.setattr(module, "MAX_WAIT", 0.3)
     hung, other = Server(gate=threading.Event()), Server()
     run = a_run(tmp_path)
-    with loggers_of(hung, other).show_run(run):
+    with show_run(run, loggers_of(hung, other)):
         run.finish([])
     until(lambda: other.status.get(run.id) == "done", "the other's end")
     assert capsys.readouterr().err.count("not shown in fake0: the logger is too slow") == 1
