@@ -17,7 +17,6 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_file, file_digest, naming_file, sync_folder
 from memmlp.runs import records
 from memmlp.runs.identity import ID
-from memmlp.runs.lookup import get_notes_path
 from memmlp.runs.run import Run
 
 MAX_FILES = 1000
@@ -38,7 +37,7 @@ def export_run(run: Run, out: Path) -> str:
     if changed := run.verify():
         raise InputError(f"run {run.id}: must be unchanged; missing or changed files: {', '.join(changed)}")
     run_files = [path for pattern in run.FILES for path in sorted(run.folder.glob(pattern))]
-    paths = [*run_files, get_notes_path(run), run.marker]
+    paths = [*run_files, run.notes_path, run.marker]
     files = {path.relative_to(run.folder).as_posix(): path for path in paths}
     out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(out) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:

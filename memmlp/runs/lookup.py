@@ -121,14 +121,9 @@ class Notes:
     archived: bool = False
 
 
-def get_notes_path(run: Run) -> Path:
-    """Return the path of the file with a run's tags and note."""
-    return run.folder / "notes.json"
-
-
 def read_notes(run: Run) -> Notes:
     """Return a run's tags and note; both are empty if the file is missing or damaged."""
-    content = records.read(get_notes_path(run), records.Notes)
+    content = records.read(run.notes_path, records.Notes)
     tags = tuple(sorted(set(content.get("tags", ()))))
     return Notes(tags, content.get("note", ""), content.get("name", ""), content.get("archived", False))
 
@@ -136,19 +131,18 @@ def read_notes(run: Run) -> Notes:
 def edit_notes(run: Run, **changes: Any) -> Notes:
     """Replace fields of a run's notes, and return them. Raises InputError for an invalid tag, note or
     name."""
-    notes = replace(read_notes(run), **changes)
-    notes = replace(
-        notes, tags=tuple(sorted(set(notes.tags))), note=notes.note.strip(), name=notes.name.strip()
-    )
-    added = set(changes.get("tags", ())).difference(read_notes(run).tags)
-    if bad := sorted(tag for tag in added if not TAG.fullmatch(tag)):
+    before = read_notes(run)
+    notes = replace(before, **changes)
+    tags = tuple(sorted(set(notes.tags)))
+    notes = replace(notes, tags=tags, note=notes.note.strip(), name=notes.name.strip())
+    if bad := [tag for tag in tags if tag not in before.tags and not TAG.fullmatch(tag)]:
         raise InputError(f"tag '{bad[0]}': must be up to 64 letters, digits and . _ + / : -")
     if len(notes.note) > MAX_LENGTH:
         raise InputError(f"note: must have at most {MAX_LENGTH} characters, but has {len(notes.note)}")
     if len(notes.name) > MAX_NAME or not notes.name.isprintable():
         raise InputError(f"name: must have at most {MAX_NAME} printable characters")
     fields = {key: value for key, value in asdict(notes).items() if value or key in ("tags", "note")}
-    write_json(get_notes_path(run), fields)
+    write_json(run.notes_path, fields)
     return notes
 
 

@@ -85,6 +85,7 @@ class Run:
         self.stop_path = self.folder / "STOP"
         self.priority_path = self.folder / "PRIORITY"
         self.log_path = self.folder / "log.txt"
+        self.notes_path = self.folder / "notes.json"
         self._lock, self._log = Lock(self.folder), MetricsLog(self.metrics_path)
 
     @classmethod
@@ -227,7 +228,7 @@ class Run:
             self.manifest_path: records.Manifest,
             self.marker: records.Marker,
             self.folder / "FAILED": records.Failure,
-            self.folder / "notes.json": records.Notes,
+            self.notes_path: records.Notes,
             self.results_path: records.Tree,
             **dict.fromkeys(sorted(self.evaluations.glob("*.json")), records.Evaluation),
             **dict.fromkeys(sorted(self.deployments.glob("*/latency.json")), records.Deployment),

@@ -42,7 +42,7 @@ def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):
 
 def test_a_tag_from_elsewhere_does_not_stop_a_note(tmp_path: Path):
     run = begun(tmp_path)
-    lookup.get_notes_path(run).write_text('{"tags": ["bad tag"], "note": ""}')
+    run.notes_path.write_text('{"tags": ["bad tag"], "note": ""}')
     assert lookup.edit_notes(run, note="hi") == lookup.Notes(("bad tag",), "hi")
     with pytest.raises(InputError, match="tag 'worse tag'"):
         lookup.add_tags(run, ["worse tag"])
@@ -51,5 +51,5 @@ def test_a_tag_from_elsewhere_does_not_stop_a_note(tmp_path: Path):
 def test_a_damaged_file_says_nothing(tmp_path: Path):
     run = begun(tmp_path)
     for content in ("", "[]", '{"tags": 5, "note": []}', '{"tags": [3], "note": null}'):
-        lookup.get_notes_path(run).write_text(content)
+        run.notes_path.write_text(content)
         assert lookup.read_notes(run) == lookup.Notes()
