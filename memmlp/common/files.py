@@ -38,6 +38,11 @@ def to_number(value: Any) -> Any:
     return float(value) if value in ("nan", "inf", "-inf") else value
 
 
+def is_number(value: Any) -> bool:
+    """Return whether a value is an int or a float; a bool is not a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def make_json_safe(value: Any) -> Any:
     """Return the value in a form that can be stored as JSON: tuples become lists, and keys, NaN and
     infinities strings."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError, suggest
-from memmlp.common.files import to_number
+from memmlp.common.files import is_number, to_number
 from memmlp.common.overrides import flatten, format_value
 from memmlp.runs.identity import SLOTS, find_option, select_training_config
 from memmlp.runs.lookup import get_run_name, read_notes
@@ -184,18 +184,14 @@ def _make_condition(key: str, sign: str, value: str) -> Condition:
     if key == "started":  # ISO 8601 times, which may be typed in part, like 2025-03
         return lambda one: bool(one.get(key)) and compare(str(one[key]), value)
     number = float(value)
-    return lambda one: _is_number(one.get(key)) and compare(one[key], number)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return lambda one: is_number(one.get(key)) and compare(one[key], number)
 
 
 def _is_equal(actual: Any, value: str) -> bool:
     """Return whether a run's value equals a typed value, which may be rounded like in tables."""
     if isinstance(actual, tuple):  # the tags of a run
         return value in actual
-    if _is_number(actual):
+    if is_number(actual):
         return _parse_number(value) in (actual, float(format_typed_value(actual)))
     typed = value.lower() if isinstance(actual, bool | None) else value.replace(", ", ",")
     return format_typed_value(actual) == typed

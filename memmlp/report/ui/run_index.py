@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import make_json_safe, to_number
+from memmlp.common.files import is_number, make_json_safe, to_number
 from memmlp.common.lease import Lock
 from memmlp.common.overrides import flatten
 from memmlp.common.processes import MIN_CORE_FRACTION
@@ -223,7 +223,7 @@ def _read_metrics(run: Run, config: Mapping[str, Any]) -> dict[str, float | str]
     return {
         sys.intern(key): value if math.isfinite(value) else str(value)
         for key, value in numbers.items()
-        if isinstance(value, int | float) and not isinstance(value, bool)
+        if is_number(value)
     }
 
 

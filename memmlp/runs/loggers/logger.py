@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
-from memmlp.common.files import digest, file_digest, make_json_safe
+from memmlp.common.files import digest, file_digest, is_number, make_json_safe
 from memmlp.common.overrides import flatten
 from memmlp.runs import records
 from memmlp.runs.lookup import get_run_name, read_notes
@@ -99,7 +99,7 @@ def read_run_facts(run: Run, running: bool = False) -> RunFacts:
         results=tuple(
             CurvePoint(key.replace(".", "/"), float(value), step, ended)
             for key, value in run.flat_results.items()
-            if _is_number(value)
+            if is_number(value) and math.isfinite(value)
         ),
         outdated="; ".join(f"{mode} ({changes})" for mode, changes in evaluations.outdated.items()),
         files=tuple(path for path in files if path.is_file()),
@@ -130,10 +130,6 @@ class LogReader:
             for record in found.values()
             for key, value in record.values.items()
         ]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _parse_time(moment: str | None) -> float:
