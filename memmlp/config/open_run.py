@@ -26,7 +26,7 @@ from memmlp.networks import checkpoint
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.refiner import RefinedModel, SAGERefinerSettings
 from memmlp.networks.settings import Release
-from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, select_training_config
+from memmlp.runs.identity import INFERENCE, STAGE_GROUPS, select_training_config
 from memmlp.runs.lookup import find_run, find_shipped_clip, get_shipped_name
 from memmlp.runs.run import Run
 from memmlp.training.devices import choose_device
@@ -34,7 +34,7 @@ from memmlp.training.request import Outcome
 from memmlp.training.run_stages import Experiment, run_experiment
 from memmlp.training.train_network import PublishedWeights, WeightsImport
 
-EFFECTIVE_GROUPS = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
+EFFECTIVE_GROUPS = (*STAGE_GROUPS, "data", "paths", "plugins", "loggers")
 """The groups with an effect on the use of a finished run. The keys in INFERENCE also have an effect."""
 
 

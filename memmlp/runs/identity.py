@@ -92,10 +92,9 @@ NEUTRAL = (
 )
 """Config keys that do not change results of any stage."""
 
-EVALUATION = ("evaluation",)
-DEPLOYMENT = ("export",)
+STAGE_GROUPS = ("evaluation", "export")
 INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps", "model.offline")
-"""Config keys of later stages; INFERENCE keys count for both, and for training with rollouts."""
+"""Config keys of evaluations and deployments. INFERENCE keys also count for training with rollouts."""
 
 NETWORK = "memmlp"
 """The kind of motion network runs, including baselines; all other kinds are prerequisite runs."""
@@ -264,7 +263,7 @@ def select_training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the config values that can change a training's result, by dotted key, without null values."""
     rollout = find_option(config, "rollout") or "teacher_forcing"
     as_live = config.get("refiner") or config.get("prerequisite") or rollout != "teacher_forcing"
-    out = (*NEUTRAL, *EVALUATION, *DEPLOYMENT, *(() if as_live else INFERENCE))
+    out = (*NEUTRAL, *STAGE_GROUPS, *(() if as_live else INFERENCE))
     flat = {key: value for key, value in flatten(config).items() if value is not None}
     counting = [key for key in flat if DRAWS.fullmatch(key) or not _is_below(key, out)]
     if "optim.tflop" in counting:  # it sets the number of steps

@@ -19,7 +19,7 @@ from memmlp.report.tables.measured_run import CORE_FRACTION_KEYS
 from memmlp.runs import records
 from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import ConfiguredEvaluations, add_solver_names
-from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, find_training_settings
+from memmlp.runs.identity import ID, INFERENCE, STAGE_GROUPS, find_training_settings
 from memmlp.runs.lookup import (
     count_training_frames,
     get_run_name,
@@ -32,7 +32,7 @@ from memmlp.runs.run import Run, name_latency
 HIDDEN_GROUPS = ("paths", "loggers", "force", "hydra", "save_predictions")
 """Config groups that the page does not list."""
 
-USE_GROUPS = {*EVALUATION, *DEPLOYMENT, *(key.split(".")[0] for key in INFERENCE)}
+USE_GROUPS = {*STAGE_GROUPS, *(key.split(".")[0] for key in INFERENCE)}
 """Config groups for evaluation and deployment of a trained network."""
 
 COSTS = {
