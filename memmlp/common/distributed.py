@@ -148,5 +148,5 @@ def copy_from_first(module: nn.Module) -> None:
         return
     from torch import distributed
 
-    for tensor in module.state_dict(keep_vars=False).values():
+    for tensor in module.state_dict().values():
         distributed.broadcast(tensor, src=0)

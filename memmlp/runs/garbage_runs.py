@@ -108,9 +108,7 @@ def _list_plans(outputs: Path) -> Iterator[Path]:
 
 
 def _read_planned_ids(path: Path) -> set[str]:
-    tasks = read_json(path).get("tasks")
-    ids = [one.get("id") for one in tasks if isinstance(one, dict)] if isinstance(tasks, list) else []
-    return {one for one in ids if isinstance(one, str)}
+    return {task["id"] for task in read_json(path).get("tasks", ())}
 
 
 def _has_notes(run: Run) -> bool:
