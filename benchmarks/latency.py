@@ -131,7 +131,6 @@ def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: 
     affect the times. Ratios compare the medians of each round: steps with AvatarPoser's bare network, and
     poses with AvatarPoser's pose.
     """
-
     chosen = [name.strip() for name in models.split(",")]
     if BASE not in chosen:
         raise InputError(f"--models {models}: must include {BASE}, the reference of the ratios")
@@ -151,7 +150,6 @@ def export_all(
     models: list[str], overrides: tuple[str, ...], folder: Path
 ) -> Iterator[tuple[tuple[str, str], Path]]:
     """Export each model's graphs, with a progress bar, and yield pairs of (model, graph) and file."""
-
     clips = [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
     for name in progress_bar(models, "exporting"):
         named, *own = name.split("+")
@@ -171,7 +169,6 @@ def export_all(
 
 def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
     """Time the steps of all files in turn, then the end-to-end poses of deployed files; see `summarize`."""
-
     times = time_steps_in_rounds(paths, rounds, steps)
     deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}
     poses = time_poses_in_rounds(deployed, rounds, steps)
@@ -200,7 +197,6 @@ def summarize(prefix: str, times: RoundTimes, base: RoundTimes) -> dict[str, flo
 
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
     """Print the rows as a table with one line per row, 80 characters wide."""
-
     print(f"milliseconds on one thread; each of {rounds} rounds times all networks")
     print("x: the time divided by AvatarPoser's time, for the network or for the whole pose")
     print("core: minimum % of a round in which the thread had a core; below 90, the times are unreliable")

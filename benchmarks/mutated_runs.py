@@ -148,18 +148,18 @@ def mutate(path: Path, dice: random.Random) -> None:
     path.write_bytes(changed)
 
 
-def make_mutants(outputs: Path, count: int, seed: int = 0) -> list[Run]:
+def make_mutants(outputs: Path, count: int) -> list[Run]:
     """Make runs with one mutated record each."""
-    dice, found = random.Random(seed), []
+    dice, found = random.Random(0), []
     for number in range(count):
         found.append(make_run(outputs, f"mutant {number}"))
         mutate(dice.choice(list_records(found[-1])), dice)
     return found
 
 
-def make_archives(folder: Path, count: int, seed: int = 0) -> list[Path]:
+def make_archives(folder: Path, count: int) -> list[Path]:
     """Make archives of runs, each with a mutated record, or with changed bytes of its own."""
-    dice, found = random.Random(seed), []
+    dice, found = random.Random(0), []
     for number in range(count):
         run = make_run(folder, f"archived {number}")
         if number % 2:

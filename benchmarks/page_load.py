@@ -38,6 +38,7 @@ SECONDS = 20.0  # of following
 @click.option("--keep", type=click.Path(path_type=Path), help="Folder for the runs; an existing one is used.")
 def main(runs: int, running: int, steps: int, keep: Path | None) -> None:
     """Print each figure beside its limit. Exits with 1 if one is above."""
+    sys.path.insert(0, str(TESTS))
     with tempfile.TemporaryDirectory() as folder:
         outputs = keep or Path(folder)
         if not (outputs / "runs").exists():
@@ -50,7 +51,6 @@ def main(runs: int, running: int, steps: int, keep: Path | None) -> None:
 
 def make_runs(outputs: Path, count: int, steps: int) -> None:
     """Write finished runs with full configs, logs, evaluations and latencies."""
-    sys.path.insert(0, str(TESTS))
     from fake_runs import fake_run
     from omegaconf import OmegaConf
 
@@ -105,7 +105,6 @@ def measure(outputs: Path, running: int) -> dict[str, float]:
 
 def time_page(url: str) -> dict[str, float]:
     """Return the times from a change in the page's controls until it is drawn, the median of five."""
-    sys.path.insert(0, str(TESTS))
     from chromium import Browser
 
     actions = {
@@ -153,7 +152,6 @@ def follow(outputs: Path, url: str, pid: int, running: int) -> float:
         about = {"id": run.id, "kind": "memmlp", "started": "2026-02-01T00:00:00+00:00", "steps": 300}
         run.manifest_path.write_text(json.dumps(about))
         run.metrics_path.write_text(make_line(1))
-    sys.path.insert(0, str(TESTS))
     from chromium import Browser
 
     with Browser() as browser:

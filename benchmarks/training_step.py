@@ -147,7 +147,6 @@ def measure_training_step(
     overrides: tuple[str, ...], rounds: int, steps: int, with_kernels: bool
 ) -> StepCost:
     """Measure the training step that overrides configure; see `measure_step_cost`."""
-
     experiment = build_experiment(compose_config(overrides))
     training, architecture = experiment.training, experiment.architecture
     if experiment.device.type != "cpu":
