@@ -22,7 +22,7 @@ from memmlp.report.pictures.import_pictures import LEFT, MIDDLE, RIGHT, find_joi
 
 IMAGES = Path(__file__).parent / "images"
 COLOURS = ("#d1242f", "#1a7f37", "#0969da")  # of X, Y and Z
-TREE = BodyTree(JOINTS, PARENTS, make_builtin_rest_joints())
+TREE = BodyTree(make_builtin_rest_joints())
 FACING = SPACES["openxr"].convert_rotations_to_amass(
     np.eye(3)
 )  # the root of a person who stands and looks forward

@@ -1,9 +1,9 @@
 """Rotations and forward kinematics on NumPy arrays, one frame at a time. Quaternions are x, y, z, w.
 `memmlp.motion.geometry` has the same functions for torch tensors, which a live stream does not import."""
 
-from collections.abc import Sequence
-
 import numpy as np
+
+from memmlp.motion.body import N_JOINTS, PARENTS, TRACKED
 
 # Let q be the outer product of a quaternion (x, y, z, w) with itself, flattened to (16,). The rotation matrix
 # m, flattened to (9,), is linear in it: m = q @ _MATRIX, and back q = (m @ _MATRIX.T + identity) / 4. So a
@@ -68,8 +68,7 @@ def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
 
 
 class BodyTree:
-    """A body: J joints, the indices of their parents (-1 for the root, which is the first joint), and the
-    rest pose (J, 3), metres, SMPL's body frame. It computes forward kinematics of one frame.
+    """A body with rest joints (22, 3), metres, SMPL's body frame, for forward kinematics of one frame.
 
     The computation doubles the chain of transforms in each step. Step k multiplies the transform of each
     joint by the transform of the ancestor 2^k levels above. So a tree of depth 8 needs three batched products
@@ -77,29 +76,26 @@ class BodyTree:
 
     Attributes:
         tracked: the indices of head, left and right wrist.
-        bone_offsets: (J, 3), metres, from the parent to the joint; 0 for the root.
-        ancestors: an array per step k with the index of the ancestor 2^k levels above each joint (J + 1). The
+        bone_offsets: (22, 3), metres, from the parent to the joint; 0 for the root.
+        ancestors: an array per step k with the index of the ancestor 2^k levels above each joint (23). The
             last entry is an extra joint above the root, with the identity transform.
     """
 
-    def __init__(self, joints: Sequence[str], parents: Sequence[int], rest: np.ndarray):
-        self.joints, self.rest = tuple(joints), rest
-        self.tracked = [self.joints.index(name) for name in ("head", "left_wrist", "right_wrist")]
-        count = len(self.joints)
-        parent = np.array([*parents, -1])
-        parent[parent < 0] = count  # the extra joint above the root is its own parent
+    def __init__(self, rest: np.ndarray):
+        self.rest, self.tracked = rest, list(TRACKED)
+        parent = np.array([N_JOINTS, *PARENTS[1:], N_JOINTS])  # the extra joint is its own parent
         self.ancestors = [parent]
-        while (self.ancestors[-1] != count).any():
+        while (self.ancestors[-1] != N_JOINTS).any():
             self.ancestors.append(self.ancestors[-1][self.ancestors[-1]])
         self.ancestors.pop()
-        self.bone_offsets = np.zeros((count, 3))
-        self.bone_offsets[1:] = rest[1:] - rest[parent[1:count]]
-        self._transforms = np.tile(np.eye(4, dtype=np.float32), (count + 1, 1, 1))
-        self._transforms[:count, :3, 3] = self.bone_offsets
+        self.bone_offsets = np.zeros((N_JOINTS, 3))
+        self.bone_offsets[1:] = rest[1:] - rest[parent[1:N_JOINTS]]
+        self._transforms = np.tile(np.eye(4, dtype=np.float32), (N_JOINTS + 1, 1, 1))
+        self._transforms[:-1, :3, 3] = self.bone_offsets
 
     def compute_positions(self, local: np.ndarray) -> np.ndarray:
-        """Return the joint positions (J, 3), metres, relative to the head, for local rotations (J, 3, 3); the
-        root's is global."""
+        """Return the joint positions (22, 3), metres, relative to the head, for local rotations (22, 3, 3);
+        the root's is global."""
         transforms = self._transforms
         transforms[:-1, :3, :3] = local
         for ancestor in self.ancestors:

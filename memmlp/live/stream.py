@@ -37,7 +37,7 @@ APART = 0.1  # minimum distance between the hands in a T-pose, metres
 FAR = 0.25  # maximum distance of a device from its joint in a T-pose, metres
 ROUNDED = 5e-4  # metres; heights with a smaller difference are equal, since the page rounds to millimetres
 FORGOTTEN = "the calibration was for another height and was removed"
-NEEDED = ("joints", "parents", "rest", "fps", "T", "branches", "features")
+NEEDED = ("rest", "fps", "T", "branches", "features")
 AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
 
 RotationFormat = Literal["matrix", "quaternion"]
@@ -61,8 +61,7 @@ class ExportedNetwork(OnnxStream):
         if meta["features"] != FEATURES:
             raise InputError(f"{path}: has inputs of another memmlp version; {AGAIN}")
         try:
-            rest = np.array(json.loads(meta["rest"]), np.float64)
-            self.body = BodyTree(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
+            self.body = BodyTree(np.array(json.loads(meta["rest"]), np.float64))
             self.fps, self.frames = float(meta["fps"]), int(meta["T"])
             self.has_position_branch = "position" in json.loads(meta["branches"])
         except (ValueError, TypeError, LookupError):

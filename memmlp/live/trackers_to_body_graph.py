@@ -20,9 +20,7 @@ from memmlp.live.rotations import BodyTree, quaternion_to_matrix
 from memmlp.live.spaces import Space, find_space
 from memmlp.motion.body import (
     HEAD,
-    JOINTS,
     N_JOINTS,
-    PARENTS,
     POSITION,
     ROTATION,
     SPARSE_ANGULAR_VELOCITY,
@@ -81,7 +79,7 @@ class FullStep(nn.Module):
         self.names = list(model.initial_state(1))
         self.register_buffer("world", torch.tensor(space.world, dtype=torch.float32))
         self.register_buffer("body", torch.tensor(space.body, dtype=torch.float32))
-        tree = BodyTree(JOINTS, PARENTS, model.normalizer.rest.double().cpu().numpy())
+        tree = BodyTree(model.normalizer.rest.double().cpu().numpy())
         self.ancestors = [torch.tensor(ancestor) for ancestor in tree.ancestors]
         self.register_buffer("bones", torch.tensor(tree.bone_offsets, dtype=torch.float32)[None, ..., None])
 

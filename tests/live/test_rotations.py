@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from memmlp.live.rotations import BodyTree, rotate_by_fraction, sixd_to_matrix, slerp
 from memmlp.motion import geometry
-from memmlp.motion.body import HEAD, JOINTS, PARENTS, make_builtin_rest_joints
+from memmlp.motion.body import HEAD, make_builtin_rest_joints
 
 LOCAL = Rotation.random(22, rng=0).as_matrix()
 
@@ -17,7 +17,7 @@ def test_gram_schmidt_and_forward_kinematics_are_those_of_torch():
     np.testing.assert_allclose(sixd_to_matrix(sixd), expected, atol=1e-12)
     root = torch.zeros(3).double()
     _, expected = geometry.forward_kinematics(torch.tensor(LOCAL), root, torch.tensor(rest))
-    found = BodyTree(JOINTS, PARENTS, rest).compute_positions(LOCAL)
+    found = BodyTree(rest).compute_positions(LOCAL)
     np.testing.assert_allclose(found, (expected - expected[HEAD]).numpy(), atol=2e-6)
 
 

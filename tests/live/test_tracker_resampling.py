@@ -15,9 +15,9 @@ from memmlp.live.tracker_resampling import (
     compute_heading,
     make_vertical_rotation,
 )
-from memmlp.motion.body import JOINTS, PARENTS, SPARSE_DIM
+from memmlp.motion.body import SPARSE_DIM
 
-SKELETON = BodyTree(JOINTS, PARENTS, tiny.REST.numpy())
+SKELETON = BodyTree(tiny.REST.numpy())
 TIMES = np.arange(240) / 60
 PERSON = wearer.person(TIMES)
 SAMPLES = [TrackerSample(*sample) for sample in zip(TIMES, PERSON.positions, PERSON.rotations, strict=True)]

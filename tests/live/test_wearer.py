@@ -15,10 +15,10 @@ from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.tracker_input import SampleWarning
 from memmlp.live.tracker_resampling import make_t_pose
-from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
+from memmlp.motion.body import JOINTS, make_builtin_rest_joints
 
 REST = make_builtin_rest_joints()
-BODY = BodyTree(JOINTS, PARENTS, REST)
+BODY = BodyTree(REST)
 PERSON = moving.person(np.arange(40) / 60)
 HEIGHT, FLOOR = 1.95, 0.4
 SIZE = HEIGHT / 1.72
@@ -141,8 +141,8 @@ def test_offsets_of_another_space_or_body_are_refused(tmp_path: Path):
         *(("unity", wider(by), r"head or wrists are 2\.0 cm away") for by in (0.03, -0.03)),
     ):
         with pytest.raises(InputError, match=rf"me\.json: .*{said}"):
-            wearer.read_calibration(tmp_path / "me.json", space, BodyTree(JOINTS, PARENTS, rest))
-    near = BodyTree(JOINTS, PARENTS, wider(0.003))  # rounding
+            wearer.read_calibration(tmp_path / "me.json", space, BodyTree(rest))
+    near = BodyTree(wider(0.003))  # rounding
     assert wearer.read_calibration(tmp_path / "me.json", "unity", near).height == 1.815
     with pytest.raises(InputError, match=r"floor=100\.5"):
         wearer.make_wearer(BODY, floor=100.5)

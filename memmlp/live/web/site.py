@@ -26,7 +26,7 @@ from memmlp.live.session.sources import TrackedClip
 from memmlp.live.spaces import SPACES
 from memmlp.live.trackers_to_body_graph import export_full
 from memmlp.live.wearer import compute_body_height
-from memmlp.motion.body import FPS, HEAT, JOINTS, LIMBS, PARENTS, TRACKED
+from memmlp.motion.body import FPS, HEAT, JOINTS, LIMBS, TRACKED
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 
@@ -170,7 +170,7 @@ def write_network(folder: Path, network: SiteNetwork) -> Entry:
         "body": {  # head and wrists in the T-pose, the lowest joint's height, and the body height, metres
             "rest": (rest[list(TRACKED)] * SPACE.body).tolist(),
             "floor": float(rest[:, 1].min()),
-            "height": compute_body_height(BodyTree(JOINTS, PARENTS, rest)),
+            "height": compute_body_height(BodyTree(rest)),
             "eyes": EYES,
         },
         "play": played,

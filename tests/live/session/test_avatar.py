@@ -17,7 +17,7 @@ from memmlp.live.session.loop import convert_to_millimetres, make_avatar_message
 from memmlp.live.session.server import Hub, LiveServer, load_page_files
 from memmlp.live.session.sources import ClipSource
 from memmlp.live.stream import BodyFrame
-from memmlp.motion.body import JOINTS, PARENTS, make_builtin_rest_joints
+from memmlp.motion.body import PARENTS, make_builtin_rest_joints
 from memmlp.motion.formats.gltf import VRM_BONES as VRM
 from memmlp.motion.formats.gltf import encode_vrm
 
@@ -29,7 +29,7 @@ def pose(size: float) -> BodyFrame:
     """A person of a size, with each joint turned by up to some 40 degrees, 30 for the whole."""
     local = Rotation.from_rotvec(RANDOM.uniform(-0.4, 0.4, (22, 3))).as_matrix()
     local[0] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ local[0]
-    body = BodyTree(JOINTS, PARENTS, REST).compute_positions(local)
+    body = BodyTree(REST).compute_positions(local)
     return body_frame(0.0, local, size * (body + np.array([0.5, -0.25, 1.6])), size * REST)
 
 
