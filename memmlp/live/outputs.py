@@ -16,7 +16,7 @@ import errno
 import socket
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -62,18 +62,6 @@ class Output(Protocol):
         """Finish pending work, such as writing files."""
 
 
-def _run_all(actions: Iterable[Callable[[], None]]) -> None:
-    """Run every action, then raise the first error."""
-    errors = []
-    for action in actions:
-        try:
-            action()
-        except Exception as error:
-            errors.append(error)
-    if errors:
-        raise errors[0]
-
-
 class Outputs:
     """Several outputs. A failing output is reported once, and the next frame is tried again."""
 
@@ -91,8 +79,10 @@ class Outputs:
                     self.report(f"{output.name}: {error.strerror or error}; other outputs continue")
 
     def close(self) -> None:
-        """Close all outputs, then raise the first error."""
-        _run_all(output.close for output in self.outputs)
+        """Close all outputs, even if some of them fail."""
+        with ExitStack() as stack:
+            for output in self.outputs:
+                stack.callback(output.close)
 
 
 def encode_osc(messages: Iterable[tuple[str, str, Iterable[Any]]]) -> bytes:
@@ -240,7 +230,9 @@ class Recorder:
         if not self.rows:
             self.report("recording: no frame was received, so no file is written")
             return
-        _run_all(partial(self._write, path, np.stack(self.rows)) for path in self.paths)
+        with ExitStack() as stack:
+            for path in reversed(self.paths):  # the stack calls the last one first
+                stack.callback(self._write, path, np.stack(self.rows))
 
     def _write(self, path: Path, rows: np.ndarray) -> None:
         """Write a file, and report its length, breaks and interpolated frames."""
