@@ -202,7 +202,7 @@ class Stream:
 
     def reset(self) -> None:
         """Restart the stream. The next sample counts as the first sample."""
-        self.reader.reset()
+        self.reader = TrackerReader(self.network.fps)
         self._trackers.reset()
         self._restart()
 
@@ -350,7 +350,7 @@ class Stream:
 
     def _restart(self) -> None:
         self.network.reset()
-        self._features.reset()
+        self._features = FeatureWriter()
         self._last = None
 
 

@@ -46,9 +46,6 @@ class TrackerReader:
 
     def __init__(self, fps: float):
         self.period = 1 / fps
-        self.reset()
-
-    def reset(self) -> None:
         self.still, self.last, self.time = np.zeros(3), np.full((3, 12), np.nan), -math.inf
 
     def take(

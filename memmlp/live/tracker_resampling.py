@@ -80,15 +80,11 @@ def compute_heading(rotation: np.ndarray) -> float:
 
 
 class LostTrackerFiller:
-    """Holds lost trackers at their last poses, and moves returning trackers to their true poses over
-    `recovery` seconds. The T-pose of the network's body gives the poses of trackers before their first
-    samples."""
+    """Holds lost trackers at their last poses, and moves returning trackers to their true poses. A T-pose of
+    the network's body gives the poses of trackers before their first samples."""
 
-    def __init__(self, body: BodyTree, recovery: float = RECOVERY):
-        self.body, self.recovery = body, recovery
-        self.reset()
-
-    def reset(self) -> None:
+    def __init__(self, body: BodyTree):
+        self.body = body
         self.last: TrackerSample | None = None
         self.lost: Lost = NONE_LOST
         self.settled = -np.inf  # time when all returning trackers are at their true poses
@@ -101,11 +97,11 @@ class LostTrackerFiller:
         returning = [was and not is_lost for was, is_lost in zip(self.lost, lost, strict=True)]
         self.lost = lost
         if any(returning):
-            self.returned[returning], self.settled = last.time, last.time + self.recovery
+            self.returned[returning], self.settled = last.time, last.time + RECOVERY
             self.shift[returning] = (last.positions - sample.positions)[returning]
             self.turn[returning] = (last.rotations @ sample.rotations.swapaxes(1, 2))[returning]
         if sample.time < self.settled:
-            share = np.clip(1 - (sample.time - self.returned) / self.recovery, 0, 1)
+            share = np.clip(1 - (sample.time - self.returned) / RECOVERY, 0, 1)
             positions = sample.positions + share[:, None] * self.shift
             rotations = rotate_by_fraction(self.turn, share) @ sample.rotations
             sample = TrackerSample(sample.time, positions, rotations)
@@ -139,12 +135,12 @@ class TrackerFrames:
     """Converts samples of three trackers to frames at the network's rate; see the module docstring."""
 
     def __init__(self, body: BodyTree, fps: float):
-        self.hold, self.fps = LostTrackerFiller(body), fps
+        self.body, self.fps = body, fps
         self.reset()
 
     def reset(self) -> None:
         """Restart. The next sample counts as the first sample."""
-        self.hold.reset()
+        self.hold = LostTrackerFiller(self.body)
         self.last: TrackerSample | None = None
         self.origin, self.count = 0.0, 0
 
@@ -178,15 +174,10 @@ class TrackerFrames:
 class FeatureWriter:
     """Computes the 54 network inputs frame by frame, like `motion.geometry.compute_sparse_features`."""
 
-    def __init__(self) -> None:
-        self.last: TrackerSample | None = None
-
-    def reset(self) -> None:
-        """Forget the last frame, so the next frame has zero velocities."""
-        self.last = None
+    last: TrackerSample | None = None
 
     def write(self, frame: TrackerSample, sparse: np.ndarray) -> None:
-        """Write the inputs of a frame into sparse (54,)."""
+        """Write the inputs of a frame into sparse (54,). The first frame has zero velocities."""
         last = self.last or frame
         positions, rotations = frame.positions, frame.rotations
         turned = last.rotations.swapaxes(1, 2) @ rotations
