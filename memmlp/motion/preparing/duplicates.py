@@ -38,8 +38,6 @@ MOVING = 2.0  # degrees: minimum mean rotation of the joints in a stretch; stand
 ALIKE = 0.2  # degrees: maximum mean deviation; repetitions by one person differ by half a degree
 NEAR = 0.05  # maximum distance between the signatures of two marked frames that are compared
 SIGNATURE = 24  # numbers per signature
-MIRRORED = np.array(SWAPPED[1:]) - 1  # the mirrored joint of each joint, without the root
-SIGNS = np.outer((-1, 1, 1), (-1, 1, 1)).ravel().astype(np.float32)  # of S R S with S = diag(-1, 1, 1)
 
 
 def assign_parts(
@@ -171,19 +169,14 @@ class MarkedFrames(NamedTuple):
 
 def mark_frames(clip: Clip) -> tuple[MarkedFrames, MarkedFrames]:
     """Mark frames of a clip at 60 Hz and of its mirror image, except where there is no motion."""
-    turns = compute_local_rotations(clip)
-    return _mark_rotations(turns), _mark_rotations(mirror_rotations(turns))
+    original, mirrored = map(compute_local_rotations, (clip, mirror_clip(clip)))
+    return _mark_rotations(original), _mark_rotations(mirrored)
 
 
 def compute_local_rotations(clip: Clip) -> np.ndarray:
     """Return the local rotation matrices (N, 21, 9) of all joints except the root."""
     rotations = Rotation.from_rotvec(clip.poses[:, 1:].reshape(-1, 3)).as_matrix()
     return rotations.reshape(len(clip), -1, 9).astype(np.float32)
-
-
-def mirror_rotations(turns: np.ndarray) -> np.ndarray:
-    """Mirror local rotations (N, 21, 9) of all joints except the root."""
-    return turns[:, MIRRORED] * SIGNS
 
 
 def _mark_rotations(turns: np.ndarray) -> MarkedFrames:
@@ -222,22 +215,24 @@ def find_shared_stretches(
     are compared."""
 
     @lru_cache(maxsize=16)
-    def read_rotations(index: int) -> np.ndarray:
-        clip = read_clip(root / clips[index].file, clips[index].name)
-        return compute_local_rotations(resample(clip, interpolation=LINES)[0])
+    def read_rotations(index: int, mirrored: bool) -> np.ndarray:
+        clip = _read_resampled(root, clips[index])
+        return compute_local_rotations(mirror_clip(clip) if mirrored else clip)
 
     every = [marks[clip.name][side] for side in (0, 1) for clip in clips]  # originals, then mirror images
     done: set[tuple[int, int]] = set()
     for one, frame, other, other_frame in _pair_marked_frames(every, NEAR):
-        mirrored = other >= len(clips)
-        two = other - len(clips) * mirrored
+        two, mirrored = other % len(clips), other >= len(clips)
         pair = min(one, two), max(one, two)
         if one >= len(clips) or pair in done or clips[one].content == clips[two].content:
             continue
-        seen = mirror_rotations(read_rotations(two)) if mirrored else read_rotations(two)
-        if _has_same_rotations(read_rotations(one), frame, seen, other_frame):
+        if _has_same_rotations(read_rotations(one, False), frame, read_rotations(two, mirrored), other_frame):
             done.add(pair)
             yield clips[pair[0]], clips[pair[1]]
+
+
+def _read_resampled(root: Root, record: ClipRecord) -> Clip:
+    return resample(read_clip(root / record.file, record.name), interpolation=LINES)[0]
 
 
 def _pair_marked_frames(
@@ -297,7 +292,7 @@ def find_conversions(
 
     @lru_cache(maxsize=16)
     def bones(index: int) -> np.ndarray:
-        clip = resample(read_clip(root / clips[index].file, clips[index].name), interpolation=LINES)[0]
+        clip = _read_resampled(root, clips[index])
         return compute_clip_kinematics(clip, make_builtin_rest_joints())[0][:, BONES]
 
     done: set[tuple[int, int]] = set()
