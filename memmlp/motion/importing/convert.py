@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.errors import InputError
 from memmlp.motion.body import HEAD, JOINTS, PARENTS
 from memmlp.motion.clip import Clip
+from memmlp.motion.formats.npz import FARTHEST
 from memmlp.motion.formats.recording import Recording
 from memmlp.motion.geometry import compute_clip_kinematics
 from memmlp.motion.importing import anatomy
@@ -54,7 +55,6 @@ UNITS = (1.0, 0.1, 0.0254 / 0.45, 0.0254, 0.01, 0.001)  # metres; 0.0254 / 0.45 
 GIVEN_LEG = (0.3, 1.5)  # metres: range of leg lengths with a given unit, from children to giants
 UPRIGHT_SHARE = 0.5  # minimum mean component of the direction from pelvis to head along the up axis
 
-POSITION_LIMIT = 1e4  # metres, as in `read_clip`
 HIP_LINE = Segment(HIPS[1], HIPS[0])
 STRAIGHTEST = "the straightest frame"
 TWIST = 1.0  # degrees: maximum twist of a limb that counts as untwisted
@@ -213,9 +213,9 @@ def convert_to_body(fitted: Retargeting, rest: np.ndarray, name: str, fps: float
     turned = Z_UP @ _aim_segments(motion, motion.rotations @ fitted.corrections, rest)
     hips = fitted.scale * motion.positions[:, list(HIPS)].mean(1) @ Z_UP.T
     trans = hips - turned[:, 0] @ (rest[list(HIPS)].mean(0) - rest[0]) - rest[0]
-    if np.abs(trans).max() > POSITION_LIMIT:
+    if np.abs(trans).max() > FARTHEST:
         far = f"the person is {np.abs(trans).max():.3g} m from the origin"
-        raise InputError(f"{motion.path}: {far}; must be within {POSITION_LIMIT:g} m")
+        raise InputError(f"{motion.path}: {far}; must be within {FARTHEST:g} m")
     local = turned.copy()
     local[:, 1:] = turned[:, list(PARENTS[1:])].swapaxes(-1, -2) @ turned[:, 1:]
     poses = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(len(local), len(JOINTS), 3)
