@@ -14,7 +14,6 @@ FRAME_RATE_RANGE = (1.0, 1000.0)
 INTERPOLATED = "interpolated"
 PIECE = 3600  # maximum number of frames that are processed at a time
 SPLINES, LINES = "splines", "lines"
-INTERPOLATIONS = (SPLINES, LINES)
 """The methods of interpolation between two recorded frames. Splines are as smooth as human motion. Lines have
 a kink at each recorded frame. For Bandai-Namco's motion at 30 Hz, that makes the jerk four times as large
 (docs/guides/checks.md)."""

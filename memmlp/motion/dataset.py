@@ -15,7 +15,6 @@ from memmlp.motion.body import FRAME_DIM, SWAPPED, TRACKED
 from memmlp.motion.preparing.find_clips import get_source_name
 from memmlp.motion.preparing.manifest import PARTS, Manifest
 
-DRAWN_BY = ("frames", "clips")
 SHARE_STEPS = 2**52  # resolution of the sources' shares
 
 
@@ -87,7 +86,7 @@ class WindowSampler:
     identified by its last frame; a clip shorter than the window has one window, which ends at the clip's last
     frame. `drawn_by` is "frames", where all windows of the part are equally likely (docs/readings.md, no.
     23), or "clips", where all clips are. `shares` are the relative frequencies of each source's windows; None
-    ignores sources. Raises InputError for an invalid `drawn_by`."""
+    ignores sources."""
 
     def __init__(
         self,
@@ -98,8 +97,6 @@ class WindowSampler:
         drawn_by: str = "frames",
         shares: Mapping[str, float] | None = None,
     ):
-        if drawn_by not in DRAWN_BY:
-            raise InputError(f"data.drawn_by={drawn_by}: must be one of {', '.join(DRAWN_BY)}")
         self.batch, self.seed, self.device = batch, seed, dataset.frames.device
         lengths = dataset.lengths.cpu().numpy()
         self.first_end = np.minimum(window, lengths) - 1

@@ -35,7 +35,7 @@ class ClipFolder:
     """The source of a cache: `root` is a folder with npz files at any depth, or several named folders; `body`
     is "builtin" or an SMPL-H model.npz. Clips with fewer frames at 60 Hz than `min_frames` are skipped; 42
     frames give T = 41 inputs. A bad file is skipped, or with `strict` raises InputError. `interpolation` is
-    one of `INTERPOLATIONS`."""
+    SPLINES or LINES."""
 
     root: Root
     split: Split
@@ -49,9 +49,6 @@ def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
     """Prepare the cache in the folder `out`, unless it is current. Only one process does so at a time. Raises
     InputError if the root has no usable clips, the split is impossible, the folder cannot be written, or a
     file is bad and `strict` is set; OSError if the disk is full or read-only."""
-    source = replace(source, body=str(source.body))
-    if source.min_frames < 2:
-        raise InputError(f"data.min_frames={source.min_frames}: must be 2 or more; one frame has no velocity")
     rest = load_rest_joints(source.body)
     clips = [source.root / file for file in find_clips(source.root).files]
     check_imported_body(clips, rest, f"data.body={source.body}")
@@ -75,7 +72,7 @@ def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
 def load_finished_cache(source: ClipFolder, out: Path) -> Manifest | None:
     """Load the manifest of the source's cache in `out`; None if the cache is unfinished or outdated."""
     try:
-        return _load_if_current(out, _compute_request_digest(source, load_rest_joints(str(source.body))))
+        return _load_if_current(out, _compute_request_digest(source, load_rest_joints(source.body)))
     except InputError:
         return None
 

@@ -115,7 +115,7 @@ class Manifest:
     rest_joints: tuple[tuple[float, ...], ...]  # (22, 3), metres
     split: dict[str, Any]  # the split's settings
     min_frames: int  # minimum number of frames of a clip at 60 Hz
-    interpolation: str  # method of resampling to 60 Hz, one of `INTERPOLATIONS`
+    interpolation: str  # method of resampling to 60 Hz, SPLINES or LINES
     clips: tuple[ClipRecord, ...]  # sorted by name
     skipped: tuple[SkippedFile, ...]  # bad files
     left_out: dict[str, int]  # top-level folder -> number of valid clips without a part

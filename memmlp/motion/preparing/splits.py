@@ -89,15 +89,12 @@ class GroupedSplit(Split):
     train_fraction: float = 1.0
 
     def __post_init__(self) -> None:
-        self._check_fractions(val=self.val)
+        self._check_fractions(self.val)
 
-    def _check_fractions(self, **fractions: float) -> None:
-        if not 0 < self.train_fraction <= 1:
-            raise InputError(f"data.split.train_fraction={self.train_fraction}: must be above 0, at most 1")
-        for key, value in fractions.items():
-            if not 0 <= value < 1:
-                raise InputError(f"data.split.{key}={value}: must be at least 0 and below 1")
-        if sum(fractions.values()) >= 1:
+    def _check_fractions(self, *fractions: float) -> None:
+        if self.train_fraction == 0:
+            raise InputError("data.split.train_fraction=0: must be above 0, at most 1")
+        if sum(fractions) >= 1:
             expected = "the sum must be less than 1, because training gets the rest"
             raise InputError(f"data.split.test, data.split.val: {expected}")
 
@@ -171,7 +168,7 @@ class SeededSplit(GroupedSplit):
     divide: str = "groups"
 
     def __post_init__(self) -> None:
-        self._check_fractions(test=self.test, val=self.val)
+        self._check_fractions(self.test, self.val)
 
     def assign(self, names: Sequence[str]) -> Assignment:
         aliases = {name: strip_archives(name) for name in names}
@@ -289,7 +286,6 @@ class ListSplit(PublishedSplit):
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
-        """Subset -> number of the split's entries."""
         return dict(Counter(entry.split("/")[0] for entry in sorted(self.entries)))
 
     def describe(self) -> dict[str, Any]:
@@ -332,7 +328,6 @@ class SubsetSplit(PublishedSplit):
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
-        """Subset -> number of the split's entries."""
         return dict.fromkeys((*self.train, *self.test), 1)
 
     def describe(self) -> dict[str, Any]:

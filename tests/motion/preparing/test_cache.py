@@ -72,8 +72,6 @@ def test_bad_files_are_skipped_with_a_reason_or_stop(root, tmp_path):
     with pytest.raises(InputError, match="npz"):
         prepare_cache(source(root, strict=True), tmp_path / "strict")
     assert not (tmp_path / "strict" / "manifest.json").exists()
-    with pytest.raises(InputError, match=r"data\.min_frames=1: "):
-        prepare_cache(source(root, min_frames=1), tmp_path / "cache")
     write_json(root / RECORD, describe_body("tall.npz", 1.1 * make_builtin_rest_joints()))
     with pytest.raises(InputError, match=r"tall\.npz.*data\.body"):
         prepare_cache(source(root), tmp_path / "cache")
