@@ -32,13 +32,7 @@ class Grouping:
 
     patterns: Sequence[str] = ()
     rows: Mapping[str, str] | None = None
-    file: Path | None = None
-
-    @classmethod
-    def from_settings(cls, patterns: Sequence[str], file: Path | str | None) -> Grouping:
-        """Make a grouping from patterns and an optional column file. Raises InputError if the file can't be
-        read or has an invalid line."""
-        return cls(tuple(patterns), read_groups(Path(file)) if file else None, Path(file) if file else None)
+    file: Path | str | None = None
 
     @property
     def digest(self) -> str | None:
@@ -86,7 +80,7 @@ class Grouping:
         return {name: rows.get(group[0], group[0]) for group in self.group_clips(aliases) for name in group}
 
 
-def read_groups(file: Path) -> dict[str, str]:
+def read_groups(file: Path | str) -> dict[str, str]:
     """Read a column file: CSV with the columns `clip` (paths below the data folder, with or without `.npz`)
     and `group`. Other columns are ignored. Raises InputError if the file can't be read or has an invalid
     line."""

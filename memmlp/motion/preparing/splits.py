@@ -26,7 +26,7 @@ from memmlp.motion.preparing.amass_names import (
     strip_archives,
 )
 from memmlp.motion.preparing.find_clips import find_files
-from memmlp.motion.preparing.groups import Grouping
+from memmlp.motion.preparing.groups import Grouping, read_groups
 
 LISTED = ("train", "test")  # the parts with published lists
 
@@ -100,7 +100,8 @@ class GroupedSplit(Split):
 
     @cached_property
     def grouping(self) -> Grouping:
-        return Grouping.from_settings(self.groups, self.groups_file)
+        rows = read_groups(self.groups_file) if self.groups_file else None
+        return Grouping(self.groups, rows, self.groups_file)
 
     @property
     def groups_digest(self) -> str | None:  # type: ignore[override]

@@ -8,11 +8,15 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.motion.preparing.groups import (
-    Grouping,
     describe_divided_folders,
     describe_unmatched_patterns,
     read_groups,
 )
+from memmlp.motion.preparing.splits import SeededSplit
+
+
+def grouped(patterns, file):
+    return SeededSplit(groups=patterns, groups_file=file).grouping
 
 
 def written(folder, text):
@@ -24,10 +28,10 @@ def written(folder, text):
 def test_groups_are_read_and_named(tmp_path):
     file = written(tmp_path, "\ufeffsession,group,clip\n1,ann,./a/1.npz\n2, ben ,b/2\n")
     assert read_groups(file) == {"a/1": "ann", "b/2": "ben"}
-    rows = Grouping.from_settings(["^(x)"], written(tmp_path, "clip,group\na,ann\nb,ann\nx1,ben\nx2,cy\n"))
+    rows = grouped(["^(x)"], written(tmp_path, "clip,group\na,ann\nb,ann\nx1,ben\nx2,cy\n"))
     seen = {name: name for name in ("b", "a", "x2", "x1")}
     assert rows.name_groups(seen) == {"a": "ann", "b": "ann", "x1": "ben", "x2": "ben"}
-    found = Grouping.from_settings(["^(x)"], None).name_groups(seen)
+    found = grouped(["^(x)"], None).name_groups(seen)
     assert found == {"a": "a", "b": "b", "x1": "x1", "x2": "x1"}
 
 
@@ -44,13 +48,13 @@ def test_bad_files_in_one_line(tmp_path, text, said):
 
 
 def test_clips_without_a_row_and_rows_without_a_clip_are_named(tmp_path):
-    grouping = Grouping.from_settings([], written(tmp_path, "clip,group\na,1\nb,1\nc,2\n"))
+    grouping = grouped([], written(tmp_path, "clip,group\na,1\nb,1\nc,2\n"))
     grouping.check(["a", "b"], ["a", "b", "c"])  # c has a file that can't be used
     with pytest.raises(InputError, match="d and 1 more"):
         grouping.check(["a", "d", "e"], ["a", "b", "c", "d", "e"])
     with pytest.raises(InputError, match=r"data\.root.* c$"):
         grouping.check(["a", "b"], ["a", "b"])
-    Grouping.from_settings([], None).check(["a"], [])
+    grouped([], None).check(["a"], [])
 
 
 def manifest_of(parts: Sequence[tuple[str, str]], split: dict[str, Any], tied: Sequence[str] = ()) -> Any:
