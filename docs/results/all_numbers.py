@@ -4,9 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from memmlp.common.text_formats import format_csv
 from memmlp.report.tables.table import Cell, Effect, Row, Table
-from memmlp.report.tables.table_text import (
-    find_unit,
-)
+from memmlp.report.tables.table_text import find_unit
 from memmlp.sweep.definition import COSTS
 
 CSV_HEADINGS = (

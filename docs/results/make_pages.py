@@ -99,7 +99,7 @@ def make_tables(folder: Path) -> dict[str, KeptTable]:
         sources = () if kept.rounds else kept.sources  # verdicts by seed rounds need all clips
         by_source = tuple(make_kept_table(kept, source) for source in sources)
         regroup = partial(make_kept_table, kept, None)
-        tables[path.stem] = KeptTable(kept, make_kept_table(kept), by_source, regroup)
+        tables[path.stem] = KeptTable(kept, make_kept_table(kept), regroup, by_source)
     return tables
 
 

@@ -50,17 +50,16 @@ class Placeholders:
             joined: a regular expression; clips with equal matches are one group in an additional last line.
             mode: the mode of evaluation.
         """
-        lines = []
-        for name in names:
-            table = self._find_table(name)
-            cells = [self._count_claims([table], mode, branch) for branch in BRANCHES]
-            lines.append([f"[{escape_markdown(make_caption(table))}]({name}.md)", *cells])
-        heads = ["table", *BRANCHES.values()]
-        for label, pattern in {"all": "", "all, contents joined": joined}.items():
-            if pattern or label == "all":
-                tables = [self._find_table(name, pattern) for name in names]
-                lines.append([label, *(self._count_claims(tables, mode, branch) for branch in BRANCHES)])
-        return make_markdown_table(heads, lines)
+        tables = {name: self._find_table(name) for name in names}
+        counted = {_link(make_caption(table), name): [table] for name, table in tables.items()}
+        counted["all"] = [*tables.values()]
+        if joined:
+            counted["all, contents joined"] = [self._find_table(name, joined) for name in names]
+        lines = (
+            [head, *(self._count_claims(found, mode, branch) for branch in BRANCHES)]
+            for head, found in counted.items()
+        )
+        return make_markdown_table(["table", *BRANCHES.values()], lines)
 
     def decisions(
         self,
@@ -108,11 +107,10 @@ class Placeholders:
             seeds = sorted({len(row.found) for row in source.table.rows if row.found})
             coarse = MISSING
             with contextlib.suppress(InputError):  # no clips to merge
-                coarse = self._count_significant(self._regroup(name, patterns)) if source.regroup else MISSING
+                coarse = self._count_significant(self._regroup(name, patterns))
             caption = f"{caption} ({name})" if captions.count(caption) > 1 else caption
-            link = f"[{escape_markdown(caption)}]({name}.md)"
             numbers = [str(source.kept.run_count), " to ".join(map(str, sorted({*seeds[:1], *seeds[-1:]})))]
-            lines.append([link, *numbers, self._count_significant(source.table), coarse])
+            lines.append([_link(caption, name), *numbers, self._count_significant(source.table), coarse])
         heads = ["page", "runs", "seeds", "significant differences", "the same with contents joined"]
         return make_markdown_table(heads, lines)
 
@@ -184,10 +182,11 @@ class Placeholders:
 
     def _regroup(self, name: str, patterns: tuple[str, ...], weigh_groups: bool = False) -> Table:
         """Return a table with other clip groups, which takes seconds to compute, at most once."""
-        regroup = self.sources[name].regroup
-        if regroup is None:
-            return self.sources[name].table
         key = name, patterns, weigh_groups
         if key not in self._regrouped:
-            self._regrouped[key] = regroup(patterns, weigh_groups)
+            self._regrouped[key] = self.sources[name].regroup(patterns, weigh_groups)
         return self._regrouped[key]
+
+
+def _link(caption: str, name: str) -> str:
+    return f"[{escape_markdown(caption)}]({name}.md)"

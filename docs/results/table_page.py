@@ -45,15 +45,15 @@ class KeptTable(NamedTuple):
     Attributes:
         kept: the results.
         table: the table computed from the results.
-        by_source: one table for each source of test clips, if there are several sources.
         regroup: makes the table with other clip groups, from patterns and whether each group has the same
             weight (`build_table.restrict_and_group_clips`).
+        by_source: one table for each source of test clips, if there are several sources.
     """
 
     kept: KeptResults
     table: Table
+    regroup: Callable[[Sequence[str], bool], Table]
     by_source: tuple[Table, ...] = ()
-    regroup: Callable[[Sequence[str], bool], Table] | None = None
 
     @property
     def by_clips(self) -> dict[str, Table]:
@@ -219,7 +219,7 @@ def _make_series_table(source: KeptTable) -> str:
     for point, rows in points.items():
         seeds = {f"{len(row.found)}/{len(row.wanted)}" for row in rows.values()}
         cells = [
-            _describe_point(rows[one].cells[mode][metric], metric) if one in rows else "" for one in series
+            _describe_cell(rows[one].cells[mode][metric], metric) if one in rows else "" for one in series
         ]
         values = _parse_point(point)
         lines.append([*(values.get(key, "") for key in keys), ", ".join(sorted(seeds)), *cells])
@@ -233,11 +233,6 @@ def _parse_point(point: str) -> dict[str, str]:
     """Return the values of a point's keys, by the last part of each key."""
     pairs = (text.partition("=") for text in point.split(", "))
     return {key.rpartition(".")[2]: escape_markdown(value) for key, _, value in pairs}
-
-
-def _describe_point(cell: Cell, metric: str) -> str:
-    """Return a mean and its difference, with the verdict unless it is inconclusive."""
-    return _describe_cell(cell, metric).replace(f" {Verdict.INCONCLUSIVE})", ")")
 
 
 def make_markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -21,7 +21,8 @@ from memmlp.sweep.definition import Sweep
 
 
 def source(sweep: Sweep, kept: KeptResults) -> KeptTable:
-    return KeptTable(kept, make_table(sweep, kept.select_runs(sweep), command=kept.command))
+    table = make_table(sweep, kept.select_runs(sweep), command=kept.command)
+    return KeptTable(kept, table, lambda patterns, weigh: table)
 
 
 def fill(template: str, table: KeptTable) -> str:
