@@ -4,7 +4,7 @@ import itertools
 import math
 import statistics
 from collections import defaultdict
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -150,10 +150,11 @@ def have_same_errors(variant: Variant, other: Variant, ours: RunsBySeed, theirs:
     if variant.branch != other.branch:
         return False
     both = [(ours[seed], theirs[seed]) for seed in ours.keys() & theirs.keys()]
-    # They are compared as texts, because NaN differs from NaN.
-    same = [pair for pair in both if pair[0].id == pair[1].id]
-    shown = [[str(run.get_branch_means(variant.branch)) for run in pair] for pair in same]
-    return any(one == two for one, two in shown)
+    branch = variant.branch  # its means are compared as texts, because NaN differs from NaN
+    return any(
+        one.id == two.id and str(one.get_branch_means(branch)) == str(two.get_branch_means(branch))
+        for one, two in both
+    )
 
 
 def _subtract_control(
@@ -230,15 +231,13 @@ def estimate_effects(
         nothing = np.full(len(keys), np.nan)
         seen = compute_detectable(differences, comparisons, groups) if sensitivity else nothing
         second = compute_bootstrap_p(differences, groups) if sensitivity else nothing
-        numbers = estimate_paired_effects(differences, groups)
+        mean, low, high, p = estimate_paired_effects(differences, groups)
         above = (average_groups(differences, groups)[0].mean(1) > 0).sum(1)
-        columns = zip(keys, *numbers[:4], second, same, seen, above, strict=True)
-        for key, mean, low, high, p, other, equal, least, count in columns:
-            values = {"low": low, "high": high}
-            tested = {"p": p, "bootstrap": other, "equal": equal, "detectable": least}
-            values |= tested if pairs[key].is_testable else {}
-            known: dict[str, Any] = {name: convert_nan_to_none(number) for name, number in values.items()}
-            found[key] = Effect(float(mean), groups_above=int(count), **known, **size)
+        tested = np.where([pairs[key].is_testable for key in keys], [p, second, same, seen], np.nan)
+        names = ("low", "high", "p", "bootstrap", "equal", "detectable")
+        for key, difference, count, *row in zip(keys, mean, above, low, high, *tested, strict=True):
+            known: dict[str, Any] = dict(zip(names, map(convert_nan_to_none, row), strict=True))
+            found[key] = Effect(float(difference), groups_above=int(count), **known, **size)
     return {key: found[key] for key in pairs}
 
 
@@ -309,25 +308,22 @@ def _add_verdicts(
 
     Holm's correction treats differences and equivalences as separate families of p-values.
     """
-    keys = list(tested)
-    p, second, equal = (
-        np.array([convert_none_to_nan(getattr(tested[key], name)) for key in keys])
-        for name in ("p", "bootstrap", "equal")
-    )
+    p, second, equal = collect_p_values(tested.values(), ("p", "bootstrap", "equal"))
     # Comparisons without a bootstrap p-value still count in its correction.
     corrected_second = correct_by_holm(np.where(np.isnan(second), p, second))
-    families = (
-        correct_by_holm(p),
-        np.where(np.isnan(second), np.nan, corrected_second),
-        correct_by_holm(equal),
-    )
+    corrected_second[np.isnan(second)] = np.nan
+    families = correct_by_holm(p), corrected_second, correct_by_holm(equal)
     judged = {}
-    for key, *corrected_p in zip(keys, *families, strict=True):
-        corrected = dict(zip(("holm", "bootstrap", "equal"), map(float, corrected_p), strict=True))
-        verdict = decide_verdict(corrected["holm"], corrected["equal"], tested[key].mean, printed.get(key))
-        numbers: dict[str, Any] = {name: convert_nan_to_none(one) for name, one in corrected.items()}
-        judged[key] = replace(tested[key], **numbers, verdict=verdict)
+    for (key, effect), *corrected in zip(tested.items(), *families, strict=True):
+        verdict = decide_verdict(corrected[0], corrected[2], effect.mean, printed.get(key))
+        holm, other, same = map(convert_nan_to_none, corrected)
+        judged[key] = replace(effect, holm=holm, bootstrap=other, equal=same, verdict=verdict)
     return judged
+
+
+def collect_p_values(effects: Collection[Effect], names: Sequence[str]) -> np.ndarray:
+    """Return p-values (n, K) of K effects by the names of their fields; NaN for None."""
+    return np.array([[getattr(effect, name) for effect in effects] for name in names], float)
 
 
 def _compare_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
@@ -356,10 +352,6 @@ def compute_mean_cost(runs: RunsBySeed, metric: str) -> float:
 
 def convert_nan_to_none(number: float) -> float | None:
     return None if math.isnan(number) else float(number)
-
-
-def convert_none_to_nan(number: float | None) -> float:
-    return math.nan if number is None else number
 
 
 def use_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Sweep:

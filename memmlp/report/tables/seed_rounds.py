@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,8 +24,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import digest
 from memmlp.report.tables.effects import (
     RunsBySeed,
+    collect_p_values,
     convert_nan_to_none,
-    convert_none_to_nan,
     estimate_effects,
     find_paper_effect,
     list_comparisons,
@@ -396,12 +395,8 @@ def _correct_p_values(
     same = np.array([claim is Verdict.EQUIVALENT for claim in claims], bool)
     differ = np.array([claim not in (Verdict.EQUIVALENT, Verdict.INCONCLUSIVE) for claim in claims], bool)
     away = np.arange(len(same)) >= len(fresh)
-    p, q = (
-        np.array(
-            [convert_none_to_nan(getattr(effect, name)) for effect in fresh] + [math.nan] * len(elsewhere)
-        )
-        for name in ("p", "equal")
-    )
+    known = collect_p_values(fresh, ("p", "equal"))
+    p, q = np.pad(known, ((0, 0), (0, len(elsewhere))), constant_values=np.nan)
     equal = correct_sequentially(q, same, away & ~same)
     different = correct_sequentially(p, differ, (away | (equal <= level)) & ~differ)
     return different[: len(fresh)], equal[: len(fresh)]

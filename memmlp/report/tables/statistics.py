@@ -53,14 +53,13 @@ class Error:
             with a single group.
         seeds: degrees of freedom of A.
         groups: degrees of freedom of B.
-        unreplicated: the factor with a single level, which the error does not cover: "seeds", "clips", "seeds
-            and clips", or "" without such a factor.
+        single: the number of factors with a single level, which the error does not cover: seeds, groups.
     """
 
     variances: np.ndarray
     seeds: float
     groups: float
-    unreplicated: str = ""
+    single: int = 0
 
     @property
     def variance_parts(self) -> np.ndarray:
@@ -151,8 +150,7 @@ def estimate_error(differences: np.ndarray, groups: Groups = None) -> Error:
     a = (means @ weights).var(1, ddof=1) / s if s > 1 else none
     b = means.mean(1).var(1, ddof=1) * (weights @ weights) if g > 1 else none
     e = estimate_noise(means, weights) if s > 1 and g > 1 else none
-    single = " and ".join(name for name, number in (("seeds", s), ("clips", g)) if number == 1)
-    return Error(np.stack([a, b, e]), max(s - 1, 1), max(g - 1, 1), single)
+    return Error(np.stack([a, b, e]), max(s - 1, 1), max(g - 1, 1), (s == 1) + (g == 1))
 
 
 def average_groups(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray, np.ndarray]:
@@ -183,17 +181,14 @@ class EffectEstimates(NamedTuple):
     Attributes:
         mean: the mean difference (K,).
         low, high: the limits of the 95 % interval (K,); NaN if undefined.
-        p: the p-value (K,); NaN if undefined.
-        unreplicated: the factor with a single level, which the interval does not cover: "seeds", "clips" (a
-            single group), "seeds and clips", or "" without such a factor. With such a factor, p-values are
-            NaN.
+        p: the p-value (K,); NaN if undefined, also with a single seed or group, which the interval does not
+            cover.
     """
 
     mean: np.ndarray
     low: np.ndarray
     high: np.ndarray
     p: np.ndarray
-    unreplicated: str
 
 
 def estimate_paired_effects(differences: np.ndarray, groups: Groups = None) -> EffectEstimates:
@@ -203,8 +198,8 @@ def estimate_paired_effects(differences: np.ndarray, groups: Groups = None) -> E
     """
     mean, known = differences.mean((1, 2)), estimate_error(differences, groups)
     nothing = np.full_like(mean, np.nan)
-    p = nothing if known.unreplicated else known.compute_significance_level(np.abs(mean))
-    return EffectEstimates(mean, *estimate_interval(differences, groups), p, known.unreplicated)
+    p = nothing if known.single else known.compute_significance_level(np.abs(mean))
+    return EffectEstimates(mean, *estimate_interval(differences, groups), p)
 
 
 def compute_bootstrap_p(differences: np.ndarray, groups: Groups = None) -> np.ndarray:
@@ -218,7 +213,7 @@ def compute_bootstrap_p(differences: np.ndarray, groups: Groups = None) -> np.nd
     or with more than FEW_GROUPS groups.
     """
     known, (_, weights) = estimate_error(differences, groups), average_groups(differences[:1], groups)
-    if known.unreplicated or len(weights) > FEW_GROUPS:
+    if known.single or len(weights) > FEW_GROUPS:
         return np.full(len(differences), np.nan)
     levels = known.compute_significance_level(np.abs(differences.mean((1, 2))))
     seed_means, seed_variances, effects = _draw_effects(int(known.seeds) + 1, tuple(weights))
@@ -260,8 +255,7 @@ def estimate_interval(values: np.ndarray, groups: Groups = None) -> tuple[np.nda
     They are NaN with a single seed and a single group.
     """
     mean, known = values.mean((1, 2)), estimate_error(values, groups)
-    undefined = known.unreplicated == "seeds and clips"
-    half = np.full_like(mean, np.nan) if undefined else known.compute_half_width(LEVEL)
+    half = np.full_like(mean, np.nan) if known.single == 2 else known.compute_half_width(LEVEL)
     return mean - half, mean + half
 
 
@@ -276,7 +270,7 @@ def compute_equivalence_p(
     seed or group.
     """
     known = estimate_error(differences, groups)
-    if known.unreplicated:
+    if known.single:
         return np.full(len(differences), np.nan)
     return known.compute_significance_level(margin - np.abs(differences.mean((1, 2))))
 
@@ -291,7 +285,7 @@ def compute_detectable(
     with a single seed or group.
     """
     known = estimate_error(differences, groups)
-    if known.unreplicated:
+    if known.single:
         return np.full(len(differences), np.nan)
     return find_detectable_effects(
         known.variance_parts, differences.shape[1], known.groups, LEVEL / comparisons, power
@@ -316,7 +310,7 @@ def count_needed_seeds(
         The number; None if `max_seeds` seeds are too few, or `differences` have a single seed or group.
     """
     known = estimate_error(differences[None], groups)
-    if known.unreplicated:
+    if known.single:
         return None
 
     def is_enough(seeds: int) -> bool:
