@@ -12,6 +12,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, HEAT, JOINTS, LIMBS
 from memmlp.report.pictures.clip_pictures import find_colour_scale_top
+from memmlp.report.ui.run_index import get_change_time
 from memmlp.runs.run import Run
 
 Predict = Callable[[Run, str, str], Mapping[str, np.ndarray]]
@@ -64,12 +65,7 @@ class Replays:
             `state` is "computing", "failed" (with `reason`) or "ready".
         """
         run = Run.from_id(self.outputs, run_id)
-        key = (
-            run_id,
-            clip,
-            mode,
-            run.marker.stat().st_mtime_ns if run.done else 0,
-        )  # changes when it is redone
+        key = run_id, clip, mode, get_change_time(run.marker)  # changes when the run is redone
         with self.lock:
             if key not in self.motions:
                 if len(self.motions) >= MAX_PREDICTIONS:

@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import math
 import os
+import statistics
 import sys
 import time
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from memmlp.report.tables.measured_run import CORE_FRACTION_KEYS
 from memmlp.runs import records
 from memmlp.runs.deployment_folder import select_deployed_measurements
 from memmlp.runs.evaluation_file import ConfiguredEvaluations, add_solver_names
-from memmlp.runs.identity import ID, INFERENCE, STAGE_GROUPS, find_training_settings
+from memmlp.runs.identity import ID, INFERENCE, NETWORK, STAGE_GROUPS, find_training_settings
 from memmlp.runs.lookup import (
     count_training_frames,
     get_run_name,
@@ -109,6 +110,19 @@ class RunIndex:
         if held not in statuses:
             statuses[held] = run.status
         return {**before, "status": statuses[held], "free": held is None}
+
+    def estimate_seconds_after(self) -> float | None:
+        """Return the median time from the end of a network's training to the end of its run, seconds."""
+        found = [run["after"] for run in self.runs.values() if run["after"] and run["kind"] == NETWORK]
+        return statistics.median(found) if found else None
+
+
+def get_change_time(path: Path) -> int:
+    """Return a file's modification time, nanoseconds; 0 if it is missing."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _list_folders(folder: Path) -> list[tuple[str, int]]:

@@ -2,7 +2,6 @@
 
 import math
 import secrets
-import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
@@ -17,8 +16,8 @@ from memmlp.report.tables.table_text import find_direction, find_unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, list_preparations, read_config
 from memmlp.runs import records
 from memmlp.runs.deployment_folder import select_deployed_measurements
-from memmlp.runs.evaluation_file import add_solver_names, read_report
-from memmlp.runs.identity import NETWORK, NEUTRAL, is_data_path
+from memmlp.runs.evaluation_file import add_solver_names
+from memmlp.runs.identity import NEUTRAL, is_data_path
 from memmlp.runs.lookup import is_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
@@ -82,14 +81,11 @@ class Rows:
         runs = self.index.runs
         keys = find_differing_keys(runs.values())
         metrics = list(dict.fromkeys(metric for run in runs.values() for metric in run["metrics"]))
-        minor = [name for name in NEUTRAL if name != "data"]
-        later = [run["after"] for run in runs.values() if run["after"] and run["kind"] == NETWORK]
+        minor = tuple(f"{name}." for name in NEUTRAL if name != "data")
         return {
-            "after": statistics.median(later) if later else None,  # seconds after training
+            "after": self.index.estimate_seconds_after(),
             "keys": keys,
-            "minor": [
-                key for key in keys if any(key == name or key.startswith(f"{name}.") for name in minor)
-            ],
+            "minor": [key for key in keys if f"{key}.".startswith(minor)],
             "paths": list(filter(is_data_path, keys)),
             "metrics": metrics,
             "units": describe_units(metrics),
@@ -148,10 +144,8 @@ def describe_units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
         if metric in COSTS:
             units[metric] = {"unit": COSTS[metric], "better": "lower"}
         elif direction := find_direction(metric):
-            units[metric] = {
-                "unit": find_unit(metric),
-                "better": "" if metric.startswith("GT ") else direction,
-            }
+            better = "" if metric.startswith("GT ") else direction
+            units[metric] = {"unit": find_unit(metric), "better": better}
     return units
 
 
@@ -212,22 +206,14 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
     if not is_trained(run):
         return []
     try:
-        found, evaluations = load_measured_run(run.folder).clips, run.configured_evaluations
-        solvers = evaluations.combined_solvers
-        frames = {
-            report["name"]: report.get("frames")
-            for path in evaluations.paths
-            for report in read_report(path)["clips"]
-        }
+        found, solvers = load_measured_run(run.folder).clips, run.configured_evaluations.combined_solvers
     except InputError:
         return []
     return [
         {
             "name": clip,
-            "frames": frames.get(clip),
-            **add_solver_names(
-                {mode: errors[mode] for mode in ("stream", "window") if mode in errors}, solvers
-            ),
+            "frames": next((report.get("frames") for report in errors.values()), None),
+            **add_solver_names({mode: errors[mode] for mode in MODES if mode in errors}, solvers),
         }
         for clip, errors in found.items()
     ]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
+from memmlp.report.ui.run_index import get_change_time
 from memmlp.runs import records
 from memmlp.runs.records import SearchRecord
 
@@ -67,13 +68,7 @@ def _find_change_time(folder: Path) -> int:
     """Return the time of a search's last change, nanoseconds; 0 if the folder does not contain a search."""
     journal = folder / "study.journal"
     signs = [journal] if journal.exists() else folder.glob("controllers/*.json")
-    times = [0]
-    for file in (folder / "search.json", *signs):
-        try:
-            times.append(file.stat().st_mtime_ns)
-        except OSError:
-            continue
-    return max(times)
+    return max(map(get_change_time, (folder / "search.json", *signs)))
 
 
 def _describe_search(folder: Path) -> dict[str, Any]:

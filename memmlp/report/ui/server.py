@@ -165,17 +165,18 @@ class Answers:
             check_type(request, Change)
         except ValueError as error:
             raise InputError(f"change: {error}") from None
-        action, value = request.get("action", ""), request.get("value", "")
+        action, value, name = (request.get(key, "") for key in ("action", "value", "name"))
         self.refresh()
         if not self.is_writable:
             raise InputError(f"{self.outputs}: must be writable; it is read-only")
-        if action == "view" and not request.get("name", "").strip():
-            raise InputError("name: must not be empty")
         if action == "view":
-            views = read_json(self.outputs / VIEWS) | {request["name"]: value}
-            write_json(self.outputs / VIEWS, {name: address for name, address in views.items() if address})
+            if not name.strip():
+                raise InputError("name: must not be empty")
+            views = read_json(self.outputs / VIEWS) | {name: value}
+            write_json(self.outputs / VIEWS, {key: address for key, address in views.items() if address})
+            return
         planned = {task.id for known in self.sweeps.known.values() for task in known.plan.tasks}
-        for run_id in request.get("runs", ()) if action != "view" else ():
+        for run_id in request.get("runs", ()):
             if run_id not in self.index.runs and not (action in FUTURE and run_id in planned):
                 raise InputError(f"run {run_id}: not found")
             run = Run.from_id(self.outputs, run_id)

@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
@@ -26,7 +25,7 @@ from memmlp.report.tables.seed_rounds import (
 )
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table_text import find_direction, make_caption, make_heading, make_legend, to_json
-from memmlp.report.ui.run_index import RunIndex
+from memmlp.report.ui.run_index import RunIndex, get_change_time
 from memmlp.runs.identity import NETWORK, find_training_settings
 from memmlp.runs.lookup import format_outputs_option
 from memmlp.runs.run import STAGE_WORDS
@@ -70,7 +69,7 @@ class Sweeps:
         sweeps, damaged = {}, {}
         for path in self.index.outputs.glob("sweeps/*/plan.json"):
             folder, name = path.parent, path.parent.name
-            stamp = tuple(_find_change_time(folder / file) for file in (path.name, SWEEP_FILE, ROUNDS_FILE))
+            stamp = tuple(get_change_time(folder / file) for file in (path.name, SWEEP_FILE, ROUNDS_FILE))
             before = self.known.get(name)
             try:
                 if before and before.stamp == stamp:
@@ -182,15 +181,13 @@ class Sweeps:
         training and the times of finished runs' evaluation and export. It is None without a busy worker, or
         if no pace is known."""
         running = [task for task in plan.tasks if states[task.key] in STAGE_WORDS.values()]
-        paces = [
-            pace for task in plan.tasks if (pace := _estimate_pace(self.index.runs.get(task.id))) is not None
-        ]
+        found = (_estimate_pace(self.index.runs.get(task.id)) for task in plan.tasks)
+        paces = [pace for pace in found if pace is not None]
         if not running or not paces:
             return None
         left = [task for task in plan.tasks if states[task.key] not in ("done", *FAULTY)]
         remaining = sum(steps[task.key][1] for task in left) * statistics.median(paces)
-        later = [run["after"] for run in self.index.runs.values() if run["after"] and run["kind"] == NETWORK]
-        after = statistics.median(later) if later else 0.0
+        after = self.index.estimate_seconds_after() or 0.0
         remaining += after * sum(task.kind == NETWORK for task in left)
         return remaining / len(running) if remaining else None
 
@@ -235,7 +232,6 @@ class Sweeps:
         command = join_command([*words, *format_outputs_option(plan.outputs)])
         table = make_table(sweep, runs, command=command, rounds=rounds)
         table = replace(table, flags=(*table.flags, *flag, *flags))
-        described = describe_rounds(rounds, sweep) if rounds else None
         branches = {variant.branch for variant in sweep.variants}
         return {
             "command": command,
@@ -248,7 +244,7 @@ class Sweeps:
                 "better": {metric: find_direction(metric) for metric in table.metrics},
                 "legend": make_legend(table),
             },
-            "rounds": described,
+            "rounds": describe_rounds(rounds, sweep) if rounds else None,
             "values": values,
         }
 
@@ -276,18 +272,8 @@ def describe_rounds(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
         decided = sum(finding.verdict is not Verdict.INCONCLUSIVE for finding in found)
         analyses.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
     variants = [asdict(variant) for variant in list_progress(rounds, sweep)]
-    return {
-        "comparisons": len(rounds.list_comparison_keys(sweep)),
-        "analyses": analyses,
-        "variants": variants,
-    }
-
-
-def _find_change_time(path: Path) -> int:
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0
+    comparisons = len(rounds.list_comparison_keys(sweep))
+    return {"comparisons": comparisons, "analyses": analyses, "variants": variants}
 
 
 def _estimate_pace(facts: Mapping[str, Any] | None) -> float | None:
