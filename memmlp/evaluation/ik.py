@@ -153,13 +153,8 @@ class JointDistance:
 
 
 def _pose(start: Tensor, turn: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return global rotations (n, 22, 3, 3) and joint positions (n, 22, 3) relative to the root, metres.
-
-    Args:
-        start: local rotations (n, 22, 3, 3).
-        turn: axis-angle increments (n, 22, 3); they multiply `start` from the right.
-        rest: rest positions (22, 3), metres.
-    """
+    """Return global rotations (n, 22, 3, 3) and joint positions (n, 22, 3) relative to the root, metres. The
+    axis-angle increments `turn` (n, 22, 3) multiply the local rotations `start` from the right."""
     return forward_kinematics(start @ axis_angle_to_matrix(turn), torch.zeros_like(turn[:, 0]), rest)
 
 

@@ -64,11 +64,9 @@ def compute_jitter(positions: Tensor) -> Tensor:
 
 def measure_positions(predicted: Tensor, truth: Tensor) -> dict[str, float]:
     """Return the position metrics of one clip as a dict from metric name to value."""
-    report = {"MPJPE": compute_position_error(predicted, truth)}
-    report |= {
-        name: compute_position_error(predicted, truth, group) for name, group in POSITION_GROUPS.items()
-    }
-    report |= {
+    report = {
+        "MPJPE": compute_position_error(predicted, truth),
+        **{name: compute_position_error(predicted, truth, group) for name, group in POSITION_GROUPS.items()},
         "MPJVE": compute_velocity_error(predicted, truth),
         "Jitter": compute_jitter(predicted),
         "GT Jitter": compute_jitter(truth),

@@ -1,6 +1,6 @@
 """Prediction files: arrays together with the truth, and clips for other programs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -142,14 +142,11 @@ class ClipPredictor:
             motions = [clip[:, SPARSE_DIM:] for clip in clips]
         else:
             motions = modes.predict(self.model, clips, self.mode, self.evaluation.batch)
-        return [
-            self._make_clip(name, make_prediction_arrays(self.model.normalizer, clip, motion, ik))
-            for name, clip, motion in zip(names, clips, motions, strict=True)
-        ]
-
-    def _make_clip(self, name: str, arrays: Mapping[str, np.ndarray]) -> Clip:
-        kind = KINDS_OF_POSES[self.branch]
-        return make_clip(name, arrays[f"{kind}_rotations"], arrays[f"{kind}_positions"], self.rest)
+        kind, made = KINDS_OF_POSES[self.branch], []
+        for name, clip, motion in zip(names, clips, motions, strict=True):
+            arrays = make_prediction_arrays(self.model.normalizer, clip, motion, ik)
+            made.append(make_clip(name, arrays[f"{kind}_rotations"], arrays[f"{kind}_positions"], self.rest))
+        return made
 
     def export(self, plan: ExportPlan, *, strict: bool = False) -> ExportReport:
         """Write the network's predictions for a plan's clips.
