@@ -28,7 +28,7 @@ from memmlp.report.tables.effects import (
     find_paper_effect,
     use_existing_branches,
 )
-from memmlp.report.tables.flags import DescribeRun, describe_nothing, find_flags, flag_early_tables
+from memmlp.report.tables.flags import DescribeRun, find_flags, flag_early_tables
 from memmlp.report.tables.measured_run import MeasuredRun, load_measured_run, select_runs_for_metric
 from memmlp.report.tables.table import Cell, Effect, Key, Row, Table
 from memmlp.report.tables.table_text import FORMATS
@@ -112,10 +112,8 @@ def list_official_values(
     """
     rows = []
     for variant in sweep.variants:
-        theirs, trained = (
-            select_imported_runs(sweep, variant, imported),
-            runs.get(variant.label, {}).values(),
-        )
+        theirs = select_imported_runs(sweep, variant, imported)
+        trained = runs.get(variant.label, {}).values()
         found = [mode for mode in modes if any(mode in run.means for run in (*theirs, *trained))]
         for mode, metric in itertools.product(found or [""], sweep.metrics):
             printed = (variant.paper or {}).get(metric)
@@ -157,7 +155,7 @@ def make_table(
     runs: Mapping[str, RunsBySeed],
     modes: Sequence[str] = MODES,
     command: str | None = None,
-    describe_run: DescribeRun = describe_nothing,
+    describe_run: DescribeRun = lambda variant, seed: None,
     rounds: Rounds | None = None,
 ) -> Table:
     """Make the table of a sweep.
@@ -355,12 +353,15 @@ def restrict_and_group_clips(
     if weigh_groups:
         if len({frozenset(run.clips) for seeds in grouped.values() for run in seeds.values()}) > 1:
             raise InputError("--weigh-groups: all runs must have the same test clips; --source may help")
-        averaged: dict[str, RunsBySeed] = {
-            label: {seed: run.average_groups() for seed, run in seeds.items()}
-            for label, seeds in grouped.items()
-        }
-        return sweep, averaged, (*flags, *group_flags, "each group of test clips has the same weight")
+        grouped = _change_runs(grouped, MeasuredRun.average_groups)
+        group_flags = (*group_flags, "each group of test clips has the same weight")
     return sweep, grouped, (*flags, *group_flags)
+
+
+def _change_runs(
+    runs: Mapping[str, RunsBySeed], change: Callable[[MeasuredRun], MeasuredRun]
+) -> dict[str, RunsBySeed]:
+    return {label: {seed: change(run) for seed, run in seeds.items()} for label, seeds in runs.items()}
 
 
 def group_clips(
@@ -382,11 +383,8 @@ def group_clips(
         InputError: if a pattern is not a regular expression, has no parentheses, or merges no groups.
     """
 
-    def regroup(patterns: Sequence[str]) -> dict[str, RunsBySeed]:
-        return {
-            label: {seed: run.group_clips(patterns) for seed, run in seeds.items()}
-            for label, seeds in runs.items()
-        }
+    def regroup(*patterns: str) -> dict[str, RunsBySeed]:
+        return _change_runs(runs, lambda run: run.group_clips(patterns))
 
     def count_groups(runs: Mapping[str, RunsBySeed]) -> int:
         every = (run for seeds in runs.values() for run in seeds.values())
@@ -398,14 +396,13 @@ def group_clips(
             captured = re.compile(pattern).groups
         except re.error as error:
             raise InputError(f"--together {pattern}: not a regular expression ({error})") from None
-        merged = regroup([pattern])
         if captured == 0:
             raise InputError(f"--together {pattern}: must have (parentheses) around the text of a group")
-        if count_groups(merged) == before:
+        if count_groups(regroup(pattern)) == before:
             raise InputError(f"--together {pattern}: must match clips in different groups; nothing to merge")
     if not patterns:
         return dict(runs), ()
-    regrouped = regroup(patterns)
+    regrouped = regroup(*patterns)
     quoted = ", ".join(f"'{pattern}'" for pattern in patterns)
     counts = f"{before} groups of test clips into {count_groups(regrouped)}"
     return regrouped, (f"--together merged {counts}: clips with equal matches of {quoted} form a group",)

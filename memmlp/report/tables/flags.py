@@ -38,10 +38,6 @@ ORIGIN = {
 }  # fmt: skip
 
 
-def describe_nothing(variant: Variant, seed: int) -> None:
-    """Return None: the default for a `DescribeRun`."""
-
-
 def find_flags(
     sweep: Sweep,
     requested: Sweep,
@@ -81,11 +77,11 @@ def find_flags(
     for attribute, what in ORIGIN.items():
         unknown = "none" if attribute == "gpu" else UNKNOWN
         values = [(getattr(run.origin, attribute).replace(UNKNOWN, unknown), label) for label, run in every]
-        yield from flag_differences(what, values)
+        yield from _flag_differences(what, values)
     yield from flag_older_code((label, run.code, run.origin.plugins) for label, run in every)
     if set(TIMES) & set(sweep.metrics):
         timed = [(run.origin.timed_on, label) for label, run in every if run.costs]
-        yield from flag_differences("machine of the times", [one for one in timed if one[0] != UNKNOWN])
+        yield from _flag_differences("machine of the times", [one for one in timed if one[0] != UNKNOWN])
         yield from _flag_busy_machine(sweep, runs)
     if has_errors:
         yield from _flag_short_training(every)
@@ -140,13 +136,8 @@ def flag_older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]
         yield f"code of {join_first(names, MAX_FILES)} {since}: {labels}"
 
 
-def flag_differences(name: str, labelled_values: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Flag a property if it differs between variants, and list the variants with each value.
-
-    Args:
-        name: the property's name.
-        labelled_values: pairs of a value and a variant label.
-    """
+def _flag_differences(name: str, labelled_values: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Flag a property with a name if its values, each with a variant's label, differ between variants."""
     groups: dict[str, list[str]] = defaultdict(list)
     for value, label in labelled_values:
         groups[value].append(label)
@@ -167,14 +158,8 @@ def join_quoted(labels: Iterable[str]) -> str:
 
 def join_first(texts: Sequence[str], max_count: int = 12) -> str:
     """Join at most `max_count` texts with commas, followed by the number of omitted texts."""
-    return ", ".join(texts[:max_count]) + (
-        f", and {len(texts) - max_count} more" if len(texts) > max_count else ""
-    )
-
-
-def describe_core_fraction(label: str, share: float) -> str:
-    """Describe a run whose thread had a core for only a fraction (`share`) of the timed period."""
-    return f"'{label}' (had a core for {100 * share:.0f} % of the time)"
+    more = f", and {len(texts) - max_count} more" if len(texts) > max_count else ""
+    return ", ".join(texts[:max_count]) + more
 
 
 def _flag_other_data(sweep: Sweep) -> Iterator[str]:
@@ -210,18 +195,15 @@ def _flag_branches(
     wanted = {variant.label: variant.branch for variant in requested.variants}
     other = [one for one in sweep.list_runnable() if one.branch != wanted[one.label]]
     if other:
-        labels, branches = (
-            join_quoted(one.label for one in other),
-            join_first(drop_repeats(one.branch for one in other)),
-        )
-        yield f"the network has no other branch, so the row shows {branches}: {labels}"
+        yield f"the network has no other branch, so the row shows {_list_branches(other)}"
     every = [(one, run) for one in sweep.list_runnable() for run in runs[one.label].values()]
     if lacking := [one for one, run in every if not run.has_branch(one.branch)]:
-        branches, labels = (
-            join_first(drop_repeats(a.branch for a in lacking)),
-            join_quoted(a.label for a in lacking),
-        )
-        yield f"not evaluated in the branch {branches}: {labels}; evaluate with: {command}"
+        yield f"not evaluated in the branch {_list_branches(lacking)}; evaluate with: {command}"
+
+
+def _list_branches(variants: Sequence[Variant]) -> str:
+    branches = join_first(drop_repeats(one.branch for one in variants))
+    return f"{branches}: {join_quoted(one.label for one in variants)}"
 
 
 def _flag_variants_sharing_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
@@ -316,17 +298,14 @@ def _flag_smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> I
     for variant in sweep.list_runnable():
         found = list(runs[variant.label].values())
         for mode in sorted({mode for run in found for mode in run.means}):
-            values = (
-                [run.get_value(mode, variant.branch, metric) for run in found]
+            predicted, truth = (
+                np.array([run.get_value(mode, variant.branch, metric) for run in found], float)
                 for metric in ("Jitter", "GT Jitter")
             )
-            predicted, truth = (
-                [number for number in column if number is not None and math.isfinite(number)]
-                for column in values
-            )
-            if predicted and truth and np.mean(predicted) < np.mean(truth):
-                text = f"'{variant.label}' {np.mean(predicted):.2f}"
-                smoother[mode, f"{np.mean(truth):.2f}"].append(text)
+            predicted, truth = predicted[np.isfinite(predicted)], truth[np.isfinite(truth)]
+            if predicted.size and truth.size and predicted.mean() < truth.mean():
+                text = f"'{variant.label}' {predicted.mean():.2f}"
+                smoother[mode, f"{truth.mean():.2f}"].append(text)
     for (mode, jitter), texts in smoother.items():
         less = f"Jitter below the truth's {jitter} ({mode}): {join_first(texts)}"
         yield f"{less}; motion that is smoother than the truth is not better"
@@ -347,9 +326,8 @@ def _flag_unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iter
     }
 
     def format_millions(label: str) -> str:
-        return "-".join(
-            drop_repeats(f"{number / 1e6:.3g}" for number in (frames[label][0], frames[label][-1]))
-        )
+        limits = frames[label][0], frames[label][-1]
+        return "-".join(drop_repeats(f"{number / 1e6:.3g}" for number in limits))
 
     unequal = []
     for variant, other in list_comparisons(sweep):
@@ -380,12 +358,10 @@ def _flag_busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator
     busy, fewer = [], []
     for variant in sweep.list_runnable():
         label, counted = variant.label, select_undisturbed_runs(runs[variant.label])
-        fractions = [
-            fraction for run in counted.values() if (fraction := find_core_fraction(run)) is not None
-        ]
+        fractions = [one for run in counted.values() if (one := find_core_fraction(run)) is not None]
         ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
         if fractions and min(fractions) < MIN_CORE_FRACTION:
-            busy.append(describe_core_fraction(label, min(fractions)))
+            busy.append(f"'{label}' (had a core for {100 * min(fractions):.0f} % of the time)")
         elif ratios and max(ratios) > MAX_TIME_RATIO * min(ratios):
             busy.append(f"'{label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
         if len(counted) < len(runs[label]):
@@ -406,18 +382,17 @@ def _flag_unequal_versions(labelled_runs: LabelledRuns) -> Iterator[str]:
     versions = [(run.origin.every_version, label) for label, run in labelled_runs]
     for name in sorted({name for known, _ in versions for name in known}):
         having = [(str(known[name]), label) for known, label in versions if name in known]
-        yield from flag_differences(f"component version of {name}", having)
+        yield from _flag_differences(f"component version of {name}", having)
     weights: dict[str, list[tuple[str, str]]] = defaultdict(list)
     for label, run in labelled_runs:
         for prerequisite, digests in run.origin.prerequisite_weights.items():
             weights[prerequisite] += [(digest, label) for digest in digests.split(", ")]
     for prerequisite, having in weights.items():  # trained again, or on another machine
-        yield from flag_differences(f"digest of the weights of prerequisite run {prerequisite}", having)
+        yield from _flag_differences(f"digest of the weights of prerequisite run {prerequisite}", having)
     for name in sorted({name for _, run in labelled_runs for name in run.origin.plugins}):
-        having = [
-            (run.origin.plugins[name], label) for label, run in labelled_runs if name in run.origin.plugins
-        ]
-        yield from flag_differences(f"code of {name}", having)
+        plugins = [(run.origin.plugins, label) for label, run in labelled_runs]
+        having = [(known[name], label) for known, label in plugins if name in known]
+        yield from _flag_differences(f"code of {name}", having)
 
 
 def _flag_bodies_and_precision(sweep: Sweep, labelled_runs: LabelledRuns) -> Iterator[str]:
@@ -444,35 +419,20 @@ def _flag_missing_replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> It
         about = "the intervals are about other clips, not about other seeds"
         yield f"one seed a variant: {about}, and nothing is significant"
     else:
-        shared = {
-            one.label: len(runs[one.label].keys() & runs[two.label].keys())
-            for one, two in list_comparisons(sweep)
-        }
-        few = [label for label, number in shared.items() if number == 1]
-        if few:
+        pairs = [(one.label, two.label) for one, two in list_comparisons(sweep)]
+        if few := [one for one, two in pairs if len(runs[one].keys() & runs[two].keys()) == 1]:
             interval = "no interval" if one_group else "an interval about other clips alone"
             yield f"one seed, so {interval}, and nothing is significant: {join_quoted(few)}"
-
-    def count_groups_of_one_clip(run: MeasuredRun) -> int:
-        return list(Counter(map(run.get_group, run.clips)).values()).count(1)
-
-    measured_runs = [run for run in every if run.clips]
-    if (
-        not one_group
-        and measured_runs
-        and all(count_groups_of_one_clip(run) >= UNGROUPED_FRACTION * len(run.clips) for run in measured_runs)
-    ):
-        alone, clips = min((count_groups_of_one_clip(run), len(run.clips)) for run in measured_runs)
+    sizes = [(Counter(map(run.get_group, run.clips)), len(run.clips)) for run in every if run.clips]
+    counts = [(list(groups.values()).count(1), clips) for groups, clips in sizes]
+    if counts and not one_group and all(alone >= UNGROUPED_FRACTION * clips for alone, clips in counts):
+        alone, clips = min(counts)
         each = f"{alone} of {clips} test clips are groups of their own"
         each = "each test clip is a group of its own" if alone == clips else each
         yield f"{each} (data.split.groups): right if no two share a person"
     if one_group and not one_seed:
         yield "one group of test clips: the intervals are about other seeds, not about other takes or people"
-    prerequisite = {label: {run.origin.prerequisite for run in found} for label, found in measured.items()}
-    one_vqvae = [
-        label
-        for label, found in measured.items()
-        if len(found) > 1 and len(prerequisite[label]) == 1 and None not in prerequisite[label]
-    ]
-    if one_vqvae:
+    several = {label: found for label, found in measured.items() if len(found) > 1}
+    used = {label: {run.origin.prerequisite for run in found} for label, found in several.items()}
+    if one_vqvae := [label for label, ids in used.items() if len(ids) == 1 and None not in ids]:
         yield f"all seeds share one VQ-VAE, so they do not replicate it: {join_quoted(one_vqvae)}"
