@@ -123,7 +123,7 @@ class MeasuredRun:
         run: the run's folder; None for kept results.
         training: known training costs: `seconds`; `frames`, the total number of frames in all training
             windows; `tflop`, the compute with prerequisite runs; `budget`, the compute that `optim.tflop`
-            asks for; and `flops` for kept results.
+            asks for.
         code: code digests by file (`compute_code_digests`), joined with different digests of prerequisite
             runs; empty for kept results.
     """
@@ -220,15 +220,12 @@ class MeasuredRun:
         """
         names, branches = list(self.clips), ("rotation", "position")
         modes = [mode for mode, known in self.means.items() if all(branch in known for branch in branches)]
-        sides = (
-            [self.get_clip_values(names, mode, branch, SHARED_METRIC) for branch in branches]
-            for mode in modes
-        )
-        known = ((one, other, np.isfinite(one + other)) for one, other in sides)
-        return all(
-            math.isclose(one[has].sum(), other[has].sum(), rel_tol=SAME_ERROR_TOLERANCE)
-            for one, other, has in known
-        )
+        for mode in modes:
+            one, other = (self.get_clip_values(names, mode, branch, SHARED_METRIC) for branch in branches)
+            known = np.isfinite(one + other)
+            if not math.isclose(one[known].sum(), other[known].sum(), rel_tol=SAME_ERROR_TOLERANCE):
+                return False
+        return True
 
 
 def _average_clips(values: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -257,10 +254,8 @@ def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> Meas
     run = Run(folder)
     run.check_records()
     manifest = records.load(run.manifest_path, records.Manifest)
-    means: dict[str, dict[str, Any]] = {}
-    clips: dict[str, dict[str, Any]] = {}
-    groups: dict[str, str] = {}
-    sources: dict[str, str] = {}
+    means, clips = dict[str, dict[str, Any]](), dict[str, dict[str, Any]]()
+    groups, sources = dict[str, str](), dict[str, str]()
     wanted = [path for name in stages or () if (path := run.evaluation(name)).is_file()]
     paths = wanted or run.configured_evaluations.paths
     reports = keep_one_solver(list(map(_read_intact_report, paths)))
@@ -274,17 +269,19 @@ def load_measured_run(folder: Path, stages: Sequence[str] | None = None) -> Meas
     deployed = (deployments or [run.find_shown_deployment(run.config)])[-1]
     latency = deployed.record
     origin = _add_evaluations(_join_prerequisite_origins(_read_origin(manifest), run), reports)
-    origin = replace(origin, deployed=find_deployed_precision(latency))
     origin = replace(
         origin,
+        deployed=find_deployed_precision(latency),
         component_versions={**origin.component_versions, **deployed.component_versions},
         timed_on=describe_timing_machine(latency),
     )
-    seconds, frames = (manifest.get("seconds") or {}).get("train"), count_training_frames(run)
-    training = {"seconds": float(seconds)} if seconds is not None else {}
-    training |= {"frames": frames} if frames else {}
-    compute = {"tflop": manifest.get("tflop"), "budget": (run.config.get("optim") or {}).get("tflop")}
-    training |= {name: float(value) for name, value in compute.items() if value is not None}
+    known = {
+        "seconds": (manifest.get("seconds") or {}).get("train"),
+        "frames": count_training_frames(run) or None,
+        "tflop": manifest.get("tflop"),
+        "budget": (run.config.get("optim") or {}).get("tflop"),
+    }
+    training = {name: float(value) for name, value in known.items() if value is not None}
     costs, code = _read_costs(latency), _read_code_digests(manifest)
     return MeasuredRun(run.id, means, clips, groups, costs, origin, run, sources, training, code)
 
@@ -352,11 +349,10 @@ def _read_origin(manifest: Mapping[str, Any]) -> Origin:
     git = manifest.get("git") or {}
     # If a training was resumed with other code, its first commit is listed too.
     before = [git["before"][:7]] if git.get("before") else []
-    copied: dict[str, Any] = {
-        name: get_text(name) for name in ("device", "gpu", "threads", "precision", "body")
-    }
-    for name in ("prerequisite", "partial", "divided", "resampled", "unusual"):
-        copied[name] = manifest.get(name)
+    texts = ("device", "gpu", "threads", "precision", "body")
+    facts = ("prerequisite", "partial", "divided", "resampled", "unusual")
+    copied: dict[str, Any] = {name: get_text(name) for name in texts}
+    copied |= {name: manifest.get(name) for name in facts}
     imported = manifest.get("imported") or {}
     return Origin(
         code=", ".join([*before, git["commit"][:7]]) if git else f"version {get_text('version')}",
@@ -403,26 +399,21 @@ def _add_evaluations(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Or
 
 def join_origins(origin: Origin, others: Sequence[Origin]) -> Origin:
     """Return an origin with the code, machines, packages and plugins of others."""
-    found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
+    every = [origin, *others]
+    found: dict[str, Any] = {"changed": any(one.changed for one in every)}
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
         found[name] = _join_unique([getattr(origin, name), *known])
-    plugins = dict(origin.plugins)
-    for other in others:
-        plugins = _merge_texts(plugins, other.plugins)
+    names = dict.fromkeys(name for one in every for name in one.plugins)
+    plugins = {
+        name: _join_unique(one.plugins[name] for one in every if name in one.plugins) for name in names
+    }
     return replace(origin, **found, plugins=plugins)
 
 
 def _join_unique(parts: Iterable[str]) -> str:
     """Join texts with commas, without repetitions. A text may itself be a comma-separated list."""
     return ", ".join(dict.fromkeys(word for part in parts for word in part.split(", ")))
-
-
-def _merge_texts(earlier: Mapping[str, str], later: Mapping[str, str]) -> dict[str, str]:
-    texts = {
-        name: dict.fromkeys([*([earlier[name]] if name in earlier else []), later[name]]) for name in later
-    }
-    return {**earlier, **{name: ", ".join(each) for name, each in texts.items()}}
 
 
 def find_core_fraction(run: MeasuredRun) -> float | None:
