@@ -6,7 +6,6 @@ are sorted by id, and numbers have six significant digits.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -18,7 +17,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write, make_json_safe
+from memmlp.common.files import atomic_write, digest, make_json_safe
 from memmlp.common.text_formats import join_command
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import Errors, MeasuredRun, Origin
@@ -92,11 +91,12 @@ class KeptResults:
         record is appended.
         """
         by_id: dict[str, dict[int, MeasuredRun]] = defaultdict(dict)
-        for run in (run for by_seed in self.runs.values() for run in by_seed.values()):
-            by_id[run.id][id(run)] = run
+        for by_seed in self.runs.values():
+            for run in by_seed.values():
+                by_id[run.id][id(run)] = run
         names: dict[int, str] = {}
         for run_id, runs in by_id.items():
-            ends = [f"/{_digest(_make_record(run))[:8]}" if len(runs) > 1 else "" for run in runs.values()]
+            ends = [f"/{digest(_make_record(run))[:8]}" if len(runs) > 1 else "" for run in runs.values()]
             several = len(set(ends)) > 1
             names |= {key: f"{run_id}{end * several}" for key, end in zip(runs, ends, strict=True)}
         return names
@@ -151,11 +151,8 @@ def list_overrides(sweep: Sweep) -> dict[str, tuple[str, ...]]:
 
 def shorten_paths(overrides: Iterable[str]) -> tuple[str, ...]:
     """Shorten absolute paths in overrides to the last part, because they differ between machines."""
-
-    def keep_last_part(path: re.Match[str]) -> str:
-        return f".../{PurePath(path[0]).name}"
-
-    return tuple(re.sub(r"(?<==)/\S*|(?<=file://)/[^\s,\]]*", keep_last_part, text) for text in overrides)
+    path = re.compile(r"(?<==)/\S*|(?<=file://)/[^\s,\]]*")
+    return tuple(path.sub(lambda found: f".../{PurePath(found[0]).name}", text) for text in overrides)
 
 
 def save_results(path: Path, kept: KeptResults) -> None:
@@ -178,7 +175,7 @@ def format_results(kept: KeptResults) -> str:
         "flags": list(kept.flags),
         **({"splits": list(kept.splits)} if kept.splits else {}),
         "clips": dict(
-            sorted({_digest(_list_clips(run))[:8]: _list_clips(run) for run in kept.all_runs}.items())
+            sorted({digest(_list_clips(run))[:8]: _list_clips(run) for run in kept.all_runs}.items())
         ),
         "cells": {
             label: {str(seed): kept.run_names[id(runs[seed])] for seed in sorted(runs)}
@@ -187,18 +184,16 @@ def format_results(kept: KeptResults) -> str:
         },
         "runs": {name: _make_record(run) for name, run in sorted(kept.runs_by_name.items())},
     }
-    content["digest"] = _digest(content)
-    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
-    return (
-        LIST_OF_VALUES.sub(lambda match: f"[{' '.join(map(str.strip, match[1].splitlines()))}]", text) + "\n"
-    )
+    content["digest"] = digest(content)[:16]
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return LIST_OF_VALUES.sub(lambda match: f"[{' '.join(map(str.strip, match[1].splitlines()))}]", text)
 
 
 def load_kept_results(path: Path) -> KeptResults:
     """Read a results file. Raises InputError if it is damaged, or was edited by hand."""
     try:
         content = json.loads(path.read_bytes())
-        if content.pop("digest", None) != _digest(content):
+        if content.pop("digest", None) != digest(content)[:16]:
             raise ValueError("edited by hand: its digest is missing or wrong")
         runs = {
             name: _parse_record(name, record, content["clips"][record["clips"]])
@@ -216,10 +211,6 @@ def load_kept_results(path: Path) -> KeptResults:
         raise InputError(f"{path}: damaged ({error}); write it again with memmlp results save") from None
 
 
-def _digest(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
 def _make_record(run: MeasuredRun) -> dict[str, Any]:
     """Return a run's record in the file: origin, costs, and the metrics of each test clip."""
     names = list(run.clips)
@@ -231,17 +222,20 @@ def _make_record(run: MeasuredRun) -> dict[str, Any]:
     errors = {
         mode: {
             branch: {
-                metric: _round_numbers(run.get_clip_values(names, mode, branch, metric)) for metric in metrics
+                metric: [*map(_round_number, run.get_clip_values(names, mode, branch, metric))]
+                for metric in metrics
             }
             for branch, metrics in branches.items()
         }
         for mode, branches in run.means.items()
     }
-    numbers = {
-        kind: dict(zip(values, _round_numbers(values.values()), strict=True))
-        for kind, values in (("costs", run.costs), ("training", run.training))
+    return {
+        "origin": origin,
+        "clips": digest(_list_clips(run))[:8],
+        "costs": {name: _round_number(cost) for name, cost in run.costs.items()},
+        "training": {name: _round_number(cost) for name, cost in run.training.items()},
+        "errors": errors,
     }
-    return {"origin": origin, "clips": _digest(_list_clips(run))[:8], **numbers, "errors": errors}
 
 
 def _list_clips(run: MeasuredRun) -> list[list[str]]:
@@ -250,10 +244,10 @@ def _list_clips(run: MeasuredRun) -> list[list[str]]:
     return [[name, run.get_group(name), *([sources[name]] if sources else [])] for name in run.clips]
 
 
-def _round_numbers(values: Iterable[float]) -> list[float | str | None]:
-    """Round numbers to six significant digits; NaN becomes None, and infinity becomes "inf"."""
-    short = [float(f"{float(value):.{SIGNIFICANT_DIGITS}g}") for value in values]
-    return [None if math.isnan(value) else value if math.isfinite(value) else str(value) for value in short]
+def _round_number(value: float) -> float | str | None:
+    """Round to six significant digits; NaN becomes None, and infinity becomes "inf"."""
+    short = float(f"{float(value):.{SIGNIFICANT_DIGITS}g}")  # an infinity from a file is a text
+    return None if math.isnan(short) else short if math.isfinite(short) else str(short)
 
 
 def _parse_record(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> MeasuredRun:
