@@ -6,10 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.statistics import LEVEL, Verdict
 from memmlp.sweep.definition import COSTS
 
-LEVEL = 0.05
 MAX_TIME_RATIO = 1.25  # maximum ratio between two measured times of the same work
 
 

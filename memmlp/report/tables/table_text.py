@@ -23,8 +23,6 @@ MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
 CONFOUNDED = "‡"  # mark of a row that differs from its control in more than its label names
 ARROWS = {"lower": "↓", "higher": "↑"}
-
-
 COLUMN_GAP = "  "  # text between columns on a terminal
 MAX_LABEL_WIDTH = 18  # maximum width of the variant column on a terminal, characters
 
@@ -100,7 +98,7 @@ def make_legend(table: Table) -> list[str]:
         groups = max(row.groups for row in table.rows)
         interval = "" if table.number else f" [95 % interval over seeds and at most {groups} groups of clips]"
         lines.append(f"mean ± sd over seeds of the means over test clips{interval}")
-    if any(True for mode in table.modes for _ in table.list_effects(mode)):
+    if any(any(table.list_effects(mode)) for mode in table.modes):
         lines += [_explain_differences(table), _explain_verdicts(table)]
         if table.analyses:
             parts = [f"{seeds} ({100 * level:.2g} %)" for seeds, level in sorted(set(table.analyses))]
@@ -123,8 +121,8 @@ def describe_branches(table: Table) -> str:
         if not row.is_paper_only:
             labels.setdefault(row.branch, []).append(row.label)
     most, *others = sorted(labels, key=lambda branch: -len(labels[branch]))
-    texts = [f"{branch} for {join_quoted(labels[branch])}" for branch in others]
-    return f"errors of the branch: {most}{' (' * bool(texts)}{'; '.join(texts)}{')' * bool(texts)}"
+    texts = "; ".join(f"{branch} for {join_quoted(labels[branch])}" for branch in others)
+    return f"errors of the branch: {most}{f' ({texts})' if texts else ''}"
 
 
 def _explain_differences(table: Table) -> str:
@@ -283,9 +281,8 @@ def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
     if effect is None:
         return (MISSING,)
     if metric in COSTS:
-        return format_significant(effect.mean, 3, "+").replace(
-            "-", MINUS
-        ) if effect.mean else "0", *_format_ratio(cell.mean, effect.mean)
+        difference = format_significant(effect.mean, 3, "+").replace("-", MINUS) if effect.mean else "0"
+        return difference, *_format_ratio(cell.mean, effect.mean)
     least = 2 if cell.mean is None else count_decimals(cell.mean)
     if effect.low is None or effect.high is None:
         return (format_signed(effect.mean, f"+.{least}f"),)
@@ -295,13 +292,14 @@ def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
     low, high = (format_signed(number, f".{digits}f") for number in (effect.low, effect.high))
     star = "*" if effect.is_significant else ""
     at = f" ({effect.decided})" if effect.decided else ""
-    verdict = () if effect.verdict is None else (f"{effect.verdict}{at}",)
-    p: tuple[str, ...] = ()
+    parts = [f"{format_signed(effect.mean, f'+.{digits}f')}{star}", f"[{low}, {high}]"]
+    if effect.verdict is not None:
+        parts.append(f"{effect.verdict}{at}")
     if effect.holm is not None and 0 < effect.groups <= FEW_GROUPS:
-        p = (f"p {format_significant(effect.holm, 2)}",)
+        parts.append(f"p {format_number(effect.holm)}")
     if effect.bootstrap is not None:
-        p += (f"bootstrap {format_significant(effect.bootstrap, 2)}",)
-    return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict, *p
+        parts.append(f"bootstrap {format_number(effect.bootstrap)}")
+    return tuple(parts)
 
 
 def format_branch_effect(effect: Effect | None, cell: Cell) -> tuple[str, ...]:
@@ -353,12 +351,8 @@ def format_paper_value(cell: Cell, metric: str) -> str:
     if cell.paper_effect is None:
         return value
     mark = {None: "", True: " ✓", False: " ✗"}[cell.agrees]
-    ratio = (
-        "".join(f" {words}" for words in _format_ratio(cell.paper, cell.paper_effect))
-        if metric in COSTS
-        else ""
-    )
-    return f"{value} ({format_signed(cell.paper_effect, f'+.{digits}f')}{mark}){ratio}"
+    ratio = _format_ratio(cell.paper, cell.paper_effect) if metric in COSTS else ()
+    return " ".join([f"{value} ({format_signed(cell.paper_effect, f'+.{digits}f')}{mark})", *ratio])
 
 
 def to_markdown(table: Table) -> str:
@@ -386,9 +380,8 @@ def to_latex(table: Table) -> str:
         lines += [" & ".join(map(escape_latex, grid.header)) + r" \\", r"\midrule"]
         lines += [" & ".join(map(escape_latex, line)) + r" \\" for line in grid.lines]
     lines += [r"\bottomrule", r"\end{tabular}"]
-    lines += [
-        rf"\par\smallskip\raggedright\footnotesize {escape_latex(line)}." for line in list_remarks(table)
-    ]
+    remarks = map(escape_latex, list_remarks(table))
+    lines += [rf"\par\smallskip\raggedright\footnotesize {remark}." for remark in remarks]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
 
 
@@ -430,10 +423,7 @@ def _divide_columns(grid: Grid, width: int) -> list[list[int]]:
     The first two columns (variant, seeds) precede each group.
     """
     columns = range(2, len(grid.header))
-    widths = [
-        _find_width(block[column] for block in _make_blocks(grid)) + len(COLUMN_GAP)
-        for column in range(len(grid.header))
-    ]
+    widths = [_find_width(column) + len(COLUMN_GAP) for column in zip(*_make_blocks(grid), strict=True)]
     for groups in range(1, len(columns) + 1):
         size = -(-len(columns) // groups)
         fits = [list(columns[i : i + size]) for i in range(0, len(columns), size)]
@@ -448,10 +438,8 @@ def _format_lines(grid: Grid, columns: Sequence[int]) -> Iterator[str]:
     widths = [_find_width(block[i] for block in blocks) for i in range(len(columns) + 2)]
     for number, block in enumerate(blocks):
         for words in itertools.zip_longest(*block, fillvalue=""):
-            padded = [
-                word.ljust(widths[i]) if i < 2 else word.rjust(widths[i]) for i, word in enumerate(words)
-            ]
-            yield COLUMN_GAP.join(padded).rstrip()
+            cells = (f"{word:{'<' if i < 2 else '>'}{widths[i]}}" for i, word in enumerate(words))
+            yield COLUMN_GAP.join(cells).rstrip()
         if number == 0:
             yield "─" * (sum(widths) + len(COLUMN_GAP) * (len(widths) - 1))
         elif len(block[1]) > 1:
@@ -467,7 +455,6 @@ def _make_blocks(grid: Grid) -> list[list[Sequence[str]]]:
 
 
 def _make_block(group: Sequence[Line]) -> list[Sequence[str]]:
-    """Return the columns of a variant, as lists of lines."""
     columns: list[list[str]] = [[] for _ in group[0][1:]]
     for _, *cells in group:
         height = max(map(len, cells))
