@@ -59,8 +59,7 @@ def find_control(sweep: Sweep, variant: Variant) -> Variant | None:
 def list_comparisons(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
     """Yield each variant that has a control, with its control."""
     for variant in sweep.list_runnable():
-        other = find_control(sweep, variant)
-        if other is not None:
+        if other := find_control(sweep, variant):
             yield variant, other
 
 
@@ -109,11 +108,8 @@ def compute_effects(
         Key(variant.label, mode, metric): find_paper_effect(sweep, variant, metric)
         for variant, mode, metric in itertools.product(sweep.list_runnable(), modes, sweep.metrics)
     }
-    return _compare_costs(sweep, runs, modes) | _add_verdicts(
-        estimate_effects(pair_differences(sweep, runs, modes), sweep.smallest, sensitivity),
-        sweep.smallest,
-        printed,
-    )
+    errors = estimate_effects(pair_differences(sweep, runs, modes), sweep.smallest, sensitivity)
+    return _compare_costs(sweep, runs, modes) | _add_verdicts(errors, printed)
 
 
 def compare_branches(
@@ -167,13 +163,8 @@ def _subtract_control(
 ) -> PairedDifferences:
     """Return the variant's errors minus the control's, on the clips for which all runs have a number.
 
-    Args:
-        sides: the runs of the variant and of the control, in the order of the seeds.
-        clips: the names of the clips that all runs have (C).
-        groups: the group index of each clip (C,).
-        branches: the branch of the variant and of the control.
-        mode: the evaluation mode.
-        metric: the metric.
+    `sides` and `branches` are those of the variant and of the control, with runs in the order of the seeds.
+    `clips` (C) are the clips that all runs have, `groups` (C,) their group indices.
     """
 
     def collect_errors(metric: str) -> np.ndarray:
@@ -195,11 +186,8 @@ def _has_diverged(values: np.ndarray, positions: np.ndarray) -> bool:
     """Return whether a network diverged on a clip without a number for a metric.
 
     The other explanation is a clip that is too short for the metric. Then no run has a number for the clip,
-    but all runs have a position error.
-
-    Args:
-        values: the metric of variant and control (2, S, C).
-        positions: position errors of variant and control (2, S, C). Runs with only NaN are ignored.
+    but all runs have a position error. `values` and `positions` are the metric and the position errors of
+    variant and control (2, S, C). Runs with only NaN as position errors are ignored.
     """
     known, placed = np.isfinite(values), np.isfinite(positions)
     measured = placed.any(2, keepdims=True)
@@ -301,9 +289,7 @@ def compute_needed_seeds(
     return found
 
 
-def _add_verdicts(
-    tested: Mapping[Key, Effect], smallest: Mapping[str, float], printed: Mapping[Key, float | None]
-) -> dict[Key, Effect]:
+def _add_verdicts(tested: Mapping[Key, Effect], printed: Mapping[Key, float | None]) -> dict[Key, Effect]:
     """Return the effects with verdicts and corrected p-values.
 
     Holm's correction treats differences and equivalences as separate families of p-values.
@@ -327,11 +313,7 @@ def collect_p_values(effects: Collection[Effect], names: Sequence[str]) -> np.nd
 
 
 def _compare_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
-    """Return differences of mean costs, without intervals.
-
-    For times, `within_noise` is set if the difference may be noise.
-    """
-
+    """Return differences of mean costs, without intervals."""
     found = {}
     for variant, other in list_comparisons(sweep):
         for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):
@@ -344,9 +326,8 @@ def _compare_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence
 
 def compute_mean_cost(runs: RunsBySeed, metric: str) -> float:
     """Return a cost's mean over the runs that `select_runs_for_metric` selects; NaN without a value."""
-    costs = [
-        run.costs[metric] for run in select_runs_for_metric(metric, runs).values() if metric in run.costs
-    ]
+    counted = select_runs_for_metric(metric, runs).values()
+    costs = [run.costs[metric] for run in counted if metric in run.costs]
     return statistics.mean(costs) if costs else math.nan  # the mean of equal costs is exactly their value
 
 

@@ -171,20 +171,18 @@ class Rounds:
         """Return the effects with the verdicts of the interim analyses."""
         latest, found = self.find_latest(), dict(effects)
         for key, effect in effects.items():
-            if not effect.verdict:
-                continue
-            if key not in latest:
+            if effect.verdict and key not in latest:
                 found[key] = replace(effect, holm=None, equal=None, verdict=Verdict.INCONCLUSIVE)
-                continue
-            finding, analysis = latest[key]
-            found[key] = replace(
-                effect,
-                holm=finding.holm,
-                equal=finding.equal,
-                verdict=finding.verdict,
-                level=analysis.level,
-                decided=None if finding.verdict is Verdict.INCONCLUSIVE else analysis.seeds,
-            )
+            elif effect.verdict:
+                finding, analysis = latest[key]
+                found[key] = replace(
+                    effect,
+                    holm=finding.holm,
+                    equal=finding.equal,
+                    verdict=finding.verdict,
+                    level=analysis.level,
+                    decided=None if finding.verdict is Verdict.INCONCLUSIVE else analysis.seeds,
+                )
         return found
 
     def find_difference(self, other: Rounds) -> str | None:
@@ -235,10 +233,7 @@ def describe_subject(sweep: Sweep) -> dict[str, Any]:
 
 
 def start_rounds(sweep: Sweep, max_seeds: int = MAX_SEEDS) -> Rounds:
-    """Return new rounds of a sweep.
-
-    The sweep's seeds come first, then the integers after the largest seed.
-    """
+    """Return new rounds of a sweep: its seeds come first, then the integers after the largest seed."""
     more_seeds = itertools.count(max(sweep.seeds) + 1)
     seeds = tuple(itertools.islice(itertools.chain(sweep.seeds, more_seeds), max_seeds))
     schedule = make_schedule(max_seeds)
@@ -307,15 +302,8 @@ def list_progress(rounds: Rounds, sweep: Sweep) -> list[VariantProgress]:
 
 
 def digest_runs(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
-    """Return a digest of the ids of runs and evaluations of a variant and its control.
-
-    Args:
-        rounds: the rounds.
-        sweep: the sweep.
-        plan: the sweep's plan.
-        label: the variant's label.
-        seeds: the number of seeds to include.
-    """
+    """Return a digest of the ids of runs and evaluations of a variant, given its label, and its control, for
+    the first `seeds` of the rounds."""
     keys = {(entry.label, entry.seed): entry.key for entry in plan.entries}
     cells = [keys.get((one, seed)) for one in _find_pair(sweep, label) for seed in rounds.seeds[:seeds]]
     return digest(cells)[:16]

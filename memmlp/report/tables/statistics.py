@@ -92,9 +92,11 @@ class Error:
     def compute_significance_level(self, distance: np.ndarray) -> np.ndarray:
         """Return the error probability (K,) at which intervals have this half width (K,).
 
-        It is 1 for half widths of 0 and below. It is NaN if `distance` or a variance is not finite, because a
-        diverged network is not evidence.
+        It is 1 for half widths of 0 and below. It is NaN with a single seed or group, and if `distance` or a
+        variance is not finite, because a diverged network is not evidence.
         """
+        if self.single:
+            return np.full(len(distance), np.nan)
         from scipy.optimize.elementwise import find_root  # slow to import
 
         # There is no closed form, so a root is searched between two bounds. The interval of the wider side
@@ -197,8 +199,7 @@ def estimate_paired_effects(differences: np.ndarray, groups: Groups = None) -> E
     Interval and p-value agree: the interval excludes 0 exactly if p < 0.05.
     """
     mean, known = differences.mean((1, 2)), estimate_error(differences, groups)
-    nothing = np.full_like(mean, np.nan)
-    p = nothing if known.single else known.compute_significance_level(np.abs(mean))
+    p = known.compute_significance_level(np.abs(mean))
     return EffectEstimates(mean, *estimate_interval(differences, groups), p)
 
 
@@ -270,8 +271,6 @@ def compute_equivalence_p(
     seed or group.
     """
     known = estimate_error(differences, groups)
-    if known.single:
-        return np.full(len(differences), np.nan)
     return known.compute_significance_level(margin - np.abs(differences.mean((1, 2))))
 
 
