@@ -78,7 +78,6 @@ def join_budgets(sources: Mapping[str, KeptTable]) -> dict[str, Table]:
 
 
 def _fill_template(name: str, text: str, placeholders: Mapping[str, object]) -> str:
-    """Render a template. Raises InputError, which names the template."""
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined, keep_trailing_newline=True, trim_blocks=True
     )

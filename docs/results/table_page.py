@@ -91,7 +91,6 @@ def shorten_remark(remark: str) -> str:
 
 
 def _describe_table(source: KeptTable) -> Iterator[str]:
-    """Yield the sentences above a page's table."""
     kept, table = source.kept, source.table
     counts = {"run": kept.run_count - kept.untrained_count, "untrained network": kept.untrained_count}
     runs = " and ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items() if count)
@@ -132,7 +131,6 @@ def _count_by_branch(table: Table) -> Iterator[str]:
 
 
 def _name_control(table: Table) -> str:
-    """Name what differences on a page are from."""
     if _has_cells(table):
         series = next(row.series for row in table.rows if row.label == table.control)
         name = f"'{escape_markdown(series)}'"
