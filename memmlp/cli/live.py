@@ -215,11 +215,11 @@ def load_tracked_clip(options: LiveOptions) -> TrackedClip:
         return TrackedClip(Path(clip).stem, read_npz_frames(Path(clip), body))
     if sys.stderr.isatty():  # it takes seconds
         print_note(f"opening run {options.network} and its test clips")
-    from memmlp.config.open_run import find_clip_index, open_run
+    from memmlp.config.open_run import find_clip, open_run
 
     test = open_run(options.outputs, options.network).test
-    index = 0 if options.clip is None else find_clip_index(test, options.clip)
-    return TrackedClip(test.names[index], test.read_clip(index).numpy())
+    name = test.names[0] if clip is None else clip
+    return TrackedClip(name, find_clip(test, name).numpy())
 
 
 def serve(options: LiveOptions) -> None:

@@ -17,7 +17,6 @@ from memmlp.cli.options import (
     warn_about_training,
 )
 from memmlp.common.errors import InputError
-from memmlp.runs.lookup import find_run
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -64,29 +63,24 @@ def predict(
     """
     check_runs_exist(outputs, run)
     from memmlp.cli.data.printing import show_exported
-    from memmlp.config.open_run import OpenedRun, build_run_experiment, load_network, load_run_data
+    from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.body import check_imported_body
     from memmlp.motion.exporting import plan_export
 
-    opened_run = find_run(outputs, run)
-    words = [] if ik is None else [f"evaluation.ik={ik}"]
-    experiment = build_run_experiment(opened_run, device, words, outputs)
-    chosen = choose_branch(experiment.evaluation, branch)
-    interpolation = experiment.motion.clips.interpolation
-    predictor = ClipPredictor(
-        load_network(opened_run, experiment), mode, chosen, experiment.evaluation, interpolation
-    )
+    opened = open_run(outputs, run, device, [] if ik is None else [f"evaluation.ik={ik}"])
+    evaluation, clips = opened.experiment.evaluation, opened.experiment.motion.clips
+    chosen = choose_branch(evaluation, branch)
+    predictor = ClipPredictor(opened.network(), mode, chosen, evaluation, clips.interpolation)
     if Path(source).exists():
         plan = plan_export(Path(source), out, format_)
         check_imported_body([target.source for target in plan.targets], predictor.rest, "the network")
         report = predictor.export(plan, strict=strict)
     else:
-        opened = OpenedRun(opened_run, experiment, load_run_data(opened_run, experiment))
         report = predict_test_clip(predictor, opened, source, out, format_)
-    click.echo(f"run {opened_run.id}: {chosen}, {mode} mode")
+    click.echo(f"run {opened.run.id}: {chosen}, {mode} mode")
     show_exported(report, out)
-    warn_about_training(opened_run)
+    warn_about_training(opened.run)
 
 
 def choose_branch(evaluation: Evaluation, branch: str | None) -> str:

@@ -64,15 +64,14 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
     """Return a run's prediction for a test clip (`make_prediction_arrays`), computed on one CPU thread."""
     import torch
 
-    from memmlp.config.open_run import OpenedRun, build_run_experiment, find_clip, load_run_data
+    from memmlp.config.open_run import find_clip, open_existing_run
     from memmlp.evaluation.predictions import predict_clip
 
     torch.set_num_threads(1)  # leaves the other threads to training processes
     with _compose_lock:
-        experiment = build_run_experiment(run)
-    if experiment.motion.find_digest() is None:
+        opened = open_existing_run(run)
+    if opened.experiment.motion.find_digest() is None:
         raise InputError(f"run {run.id}: its data is not prepared here; prepare it with memmlp eval {run.id}")
-    opened = OpenedRun(run, experiment, load_run_data(run, experiment))
     with torch.inference_mode():
         return predict_clip(opened.network(), find_clip(opened.test, clip, "clip"), mode)
 

@@ -3,9 +3,9 @@
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -38,12 +38,28 @@ EFFECTIVE_GROUPS = (*STAGE_GROUPS, "data", "paths", "plugins", "loggers")
 """The groups with an effect on the use of a finished run. The keys in INFERENCE also have an effect."""
 
 
-class OpenedRun(NamedTuple):
-    """A finished run with its experiment and prepared data."""
+@dataclass(frozen=True)
+class OpenedRun:
+    """A finished run with its experiment. The network and the data are loaded when they are used."""
 
     run: Run
     experiment: Experiment
-    data: PreparedMotion | ShippedMotion
+
+    @cached_property
+    def data(self) -> PreparedMotion | ShippedMotion:
+        """The prepared data. Raises InputError if it has changed since the training.
+
+        For a shipped network without data.root=FOLDER, the data is the shipped clip.
+        """
+        run, motion = self.run, self.experiment.motion
+        root = self.experiment.config["data"]["root"]
+        if get_shipped_name(run) and Path(root) == find_shipped_clip().parent:
+            return ShippedMotion(find_shipped_clip(), load_rest_joints(str(motion.clips.body)))
+        # Clips of the list may be missing, as long as the digest matches the training data.
+        data = replace(motion, partial=True).prepare()
+        if data.digest != run.manifest["data"]:
+            raise InputError(f"run {run.id}: its data has changed since the training (data.root={root})")
+        return data
 
     @property
     def test(self) -> MotionDataset:
@@ -52,37 +68,20 @@ class OpenedRun(NamedTuple):
 
     def network(self) -> MotionModel:
         """The trained network, in evaluation mode, on the experiment's device."""
-        return load_network(self.run, self.experiment)
+        return self.experiment.architecture.load(self.run.weights()).to(self.experiment.device)
 
 
 def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
     """Open a finished run in `outputs`, given its id, the beginning of one, or its folder, with overrides of
-    the evaluation and the export. Raises InputError if the run does not exist, an override would change its
-    training or have no effect, or its data has changed since the training."""
+    the evaluation and the export. Raises InputError if the run does not exist, or an override would change
+    its training or have no effect."""
     run = find_run(outputs, name)
-    experiment = build_run_experiment(run, device_name, overrides, outputs)
-    return OpenedRun(run, experiment, load_run_data(run, experiment))
+    return OpenedRun(run, build_run_experiment(run, device_name, overrides, outputs))
 
 
 def open_existing_run(run: Run) -> OpenedRun:
     """Open a finished run like `open_run`, from its `Run` object, on the CPU."""
-    experiment = build_run_experiment(run)
-    return OpenedRun(run, experiment, load_run_data(run, experiment))
-
-
-def load_run_data(run: Run, experiment: Experiment) -> PreparedMotion | ShippedMotion:
-    """Return the prepared data of a run. Raises InputError if the data has changed since the training.
-
-    For a shipped network without data.root=FOLDER, the data is the shipped clip.
-    """
-    root = experiment.config["data"]["root"]
-    if get_shipped_name(run) and Path(root) == find_shipped_clip().parent:
-        return ShippedMotion(find_shipped_clip(), load_rest_joints(str(experiment.motion.clips.body)))
-    # Clips of the list may be missing, as long as the digest matches the training data.
-    data = replace(experiment.motion, partial=True).prepare()
-    if data.digest != run.manifest["data"]:
-        raise InputError(f"run {run.id}: its data has changed since the training (data.root={root})")
-    return data
+    return OpenedRun(run, build_run_experiment(run))
 
 
 def build_run_experiment(
@@ -99,11 +98,6 @@ def build_run_experiment(
         if word.group not in EFFECTIVE_GROUPS and word.key not in INFERENCE:  # such as force=true
             raise InputError(f"{word}: has no effect on a finished run; set keys of evaluation and export")
     return experiment
-
-
-def load_network(run: Run, experiment: Experiment) -> MotionModel:
-    """Return the trained network of a run, in evaluation mode, on the experiment's device."""
-    return experiment.architecture.load(run.weights()).to(experiment.device)
 
 
 def import_weights(
@@ -187,12 +181,8 @@ def _naming_checkpoint(path: Path) -> Iterator[None]:
 
 
 def find_clip(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:
-    """Return all frames (N, 252) of a test clip. Raises InputError for an unknown name."""
-    return test.read_clip(find_clip_index(test, name, key))
-
-
-def find_clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
-    """Return the index of a test clip. Raises InputError, which begins with `key`, for an unknown name."""
+    """Return all frames (N, 252) of a test clip. Raises InputError, which begins with `key`, for an unknown
+    name."""
     if name not in test.names:
         raise InputError(f"{key} {name}: must be one of the run's test clips ({', '.join(test.names)})")
-    return test.names.index(name)
+    return test.read_clip(test.names.index(name))
