@@ -182,9 +182,10 @@ def compose_sweep(values: dict[str, Any]) -> None:
     if name.isupper() or name == "all" or name.endswith(".yaml"):  # a reader's, or many
         compose_once([word for word in rest if not word.startswith("seed=")])
         return
-    variants = find_sweep(name).with_overrides(rest).list_variant_seeds()
+    sweep = find_sweep(name).with_overrides(rest)
+    variants = sweep.list_runnable()
     for one in (variants[0], variants[-1]):
-        compose_once(one.overrides)
+        compose_once(sweep.merge_overrides(one))
 
 
 def compose_search(overrides: Sequence[str]) -> None:
@@ -282,7 +283,7 @@ def test_examples_of_the_guides_work(tmp_path: Path, monkeypatch: pytest.MonkeyP
     (tmp_path / "mine.yaml").write_text(examples("sweeps", "yaml")[0])
     sweep = load_sweep(tmp_path / "mine.yaml")
     assert sweep.control == "2, 4, 6, 8"
-    for one in sweep.list_variant_seeds():
-        compose_config(one.overrides)
+    for one in sweep.list_runnable():
+        compose_config(sweep.merge_overrides(one))
     skeleton = yaml.safe_load(examples("motion", "yaml")[0])
     assert set(skeleton) == set(SkeletonMap.__dataclass_fields__)

@@ -162,7 +162,8 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
 
 def count_unprepared_runs(chosen: Sweep, plan: Plan, labels: Collection[str]) -> int:
     """Return the number of runs of these variants that the plan lacks because data is not prepared yet."""
-    return sum(one.label in labels for one in chosen.list_variant_seeds()) - len(plan.entries)
+    shown = [variant for variant in chosen.list_runnable() if variant.label in labels]
+    return sum(len(chosen.get_seeds(variant)) for variant in shown) - len(plan.entries)
 
 
 def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: Workers, folder: Path) -> None:

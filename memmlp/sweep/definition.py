@@ -49,15 +49,6 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class VariantSeed:
-    """A variant with one seed, as overrides of `memmlp train`."""
-
-    label: str
-    seed: int
-    overrides: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Sweep:
     """The content of a sweep file, with overrides added on the command line. `smallest` is the smallest
     effect of interest for each metric except costs, in the metric's unit."""
@@ -136,14 +127,6 @@ class Sweep:
             wrong = f"sweep {self.name}: no variant '{missing[0]}' can be run"
             raise InputError(f"{wrong}; expected {', '.join(labels)}")
         return tuple(names) or tuple(labels)
-
-    def list_variant_seeds(self) -> list[VariantSeed]:
-        """Return each variant with each of its seeds, ordered by variant."""
-        return [
-            VariantSeed(variant.label, seed, (*self.merge_overrides(variant), f"seed={seed}"))
-            for variant in self.list_runnable()
-            for seed in self.get_seeds(variant)
-        ]
 
 
 def parse_key(override: str) -> str:

@@ -12,13 +12,11 @@ from memmlp.sweep.sweep_file import parse_sweep
 VARIANTS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
 
 
-def test_jobs_are_variants_by_seeds_with_base_and_difference():
+def test_runs_are_variants_by_seeds_with_base_and_difference():
     sweep = parse_sweep("s", {"base": ["profile=tiny"], "seeds": [0, 2], "variants": VARIANTS})
-    assert [(one.label, one.seed, one.overrides) for one in sweep.list_variant_seeds()] == [
-        ("full", 0, ("profile=tiny", "seed=0")),
-        ("full", 2, ("profile=tiny", "seed=2")),
-        ("none", 0, ("profile=tiny", "memory=none", "seed=0")),
-        ("none", 2, ("profile=tiny", "memory=none", "seed=2")),
+    assert [(one.label, sweep.get_seeds(one), sweep.merge_overrides(one)) for one in sweep.variants] == [
+        ("full", (0, 2), ("profile=tiny",)),
+        ("none", (0, 2), ("profile=tiny", "memory=none")),
     ]
 
 
