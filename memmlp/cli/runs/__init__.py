@@ -2,23 +2,7 @@
 
 import click
 
-from memmlp.cli.runs.listing import list_runs
-from memmlp.cli.runs.show import diff, show
-from memmlp.cli.runs.storage import (
-    archive,
-    delete,
-    export,
-    gc,
-    import_,
-    note,
-    prioritize,
-    rename,
-    restore,
-    retry,
-    stop,
-    tag,
-    unprioritize,
-)
+from memmlp.cli.runs import listing, show, storage
 
 
 @click.group("runs")
@@ -26,8 +10,7 @@ def runs() -> None:
     """List, show, compare, tag, clean up and move runs."""
 
 
-for command in (
-    list_runs, show, diff, tag, note, rename, stop, retry, prioritize, unprioritize, archive, restore, delete,
-    gc, export, import_,
-):  # fmt: skip
-    runs.add_command(command)
+for module in (listing, show, storage):
+    for command in vars(module).values():
+        if isinstance(command, click.Command):
+            runs.add_command(command)
