@@ -79,8 +79,6 @@ def predict_shipped_clip(label: str) -> ClipPiece:
 
 def run_ablation(overrides: Sequence[str], outputs: Path) -> Run:
     """Finish the demo's sweep, print its table, and return the first run of its control."""
-    from memmlp.report.tables.measured_run import load_measured_run
-
     executor, settings, overrides = split_executor(overrides)
     chosen = find_sweep(ABLATION, overrides)
     click.echo("\n2. an ablation on synthetic motion: Mem-MLP with and without its memory, two seeds each")
@@ -89,7 +87,7 @@ def run_ablation(overrides: Sequence[str], outputs: Path) -> Run:
         run_workers(chosen, plan, Workers(executor, settings))
     command = join_command(["memmlp", "sweep", ABLATION, *overrides])
     shown = ShownSweep(chosen, plan, None)
-    print_tables([make_plan_table(shown, SHOWN_MODES["stream"], command, load_measured_run).table])
+    print_tables([make_plan_table(shown, SHOWN_MODES["stream"], command).table])
     run = next(plan.get_run(entry) for entry in plan.entries if entry.label == chosen.control)
     if not run.done:
         raise InputError(f"run {run.id}: {run.fault or 'is not finished'}; memmlp sweep {ABLATION} --retry")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from memmlp.cli.options import (
     config_dir_option,
     untrained_option,
 )
-from memmlp.cli.table import flag_changed_rounds, load_shown_sweep, print_tables
+from memmlp.cli.table import find_shown_runs, flag_changed_rounds, load_shown_sweep, print_tables
 from memmlp.common.errors import InputError
 from memmlp.common.files import make_json_safe
 from memmlp.config.compose_plan import find_sweep, is_path
@@ -52,18 +51,10 @@ def save_command(
     additional runs.
     """
     from memmlp.report.kept_results import KeptResults, list_overrides, shorten_paths
-    from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
-    from memmlp.report.tables.measured_run import load_measured_run
 
     sweep = find_sweep(name, overrides)
     shown = load_shown_sweep(sweep, overrides, outputs.absolute())
-    finder, flags = make_run_finder(shown.plan, functools.cache(load_measured_run)), shown.flags
-    runs = find_finished_runs(shown.sweep, finder)
-    if untrained:
-        from memmlp.config.untrained_costs import measure_untrained_variants
-
-        runs, more_flags = measure_untrained_variants(shown.sweep, runs)
-        flags = (*flags, *more_flags)
+    runs, flags = find_shown_runs(shown, untrained)
     kept = KeptResults(
         name if is_path(name) else sweep.name,
         shorten_paths(word for word in overrides if not word.startswith("seed=")),

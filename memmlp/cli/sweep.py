@@ -182,13 +182,12 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: W
 def show_outcome(shown: ShownSweep, arguments: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:
     """Print a table, failed runs and the next command. Exits with 1 if a run of the `labels` has failed."""
     from memmlp.report.tables.build_table import write_table
-    from memmlp.report.tables.measured_run import load_measured_run
 
     plan, rounds = shown.plan, shown.rounds
     command = join_command(["memmlp", "sweep", *arguments, *format_config_dir()])
     states = plan.read_states()
     failed = [task for task in plan.select_variants(labels).tasks if states[task.key] in FAULTY]
-    found = make_plan_table(shown, SHOWN_MODES["both"], command, load_measured_run)
+    found = make_plan_table(shown, SHOWN_MODES["both"], command)
     write_table(found.table, get_sweep_folder(chosen, plan.outputs))
     print_tables([found.table])
     for line in describe_end(rounds, chosen) if rounds else ():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,6 @@ from memmlp.sweep.definition import BRANCHES, Sweep
 from memmlp.sweep.plan import Plan
 
 if TYPE_CHECKING:
-    from memmlp.report.tables.build_table import ReadRun
     from memmlp.report.tables.effects import RunsBySeed
     from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.report.tables.table import Table
@@ -90,11 +88,9 @@ def table(
     NAME is the path of a sweep file, a shipped sweep, the number of a table, or `all`. Use the same OVERRIDES
     as in `memmlp sweep`, so that the command finds the sweep's runs.
     """
-    from memmlp.report.tables.measured_run import load_measured_run
-
     selection = TableSelection(branch, source, together, weigh_groups, untrained)
-    modes, read = SHOWN_MODES[mode], functools.cache(load_measured_run)
-    results = gather_tables(name, overrides, outputs, modes, read, selection)
+    modes = SHOWN_MODES[mode]
+    results = gather_tables(name, overrides, outputs, modes, selection)
     tables = [one.table for one in results]
     if seeds_needed:
         return print_needed_seeds(results, modes)
@@ -164,12 +160,7 @@ class SweepTable(NamedTuple):
 
 
 def gather_tables(
-    name: str,
-    overrides: Sequence[str],
-    outputs: Path,
-    modes: Sequence[str],
-    read: ReadRun,
-    selection: TableSelection = EVERYTHING,
+    name: str, overrides: Sequence[str], outputs: Path, modes: Sequence[str], selection: TableSelection
 ) -> list[SweepTable]:
     """Make the tables of one sweep, or with `all`, of all tables of the paper. If a table's config is
     incomplete (for example without the folder of AMASS), it shows only the paper's values and the reason."""
@@ -185,7 +176,7 @@ def gather_tables(
             check_costs(sweep)
         try:
             shown = load_shown_sweep(sweep, overrides, outputs.absolute())
-            tables.append(make_plan_table(shown, modes, command, read, selection))
+            tables.append(make_plan_table(shown, modes, command, selection))
         except InputError as error:
             failures.append(error)
             table = make_empty_table(sweep, modes, f"nothing measured: {error}")
@@ -197,36 +188,36 @@ def gather_tables(
 
 
 def make_plan_table(
-    shown: ShownSweep,
-    modes: Sequence[str],
-    command: str,
-    read: ReadRun,
-    selection: TableSelection = EVERYTHING,
+    shown: ShownSweep, modes: Sequence[str], command: str, selection: TableSelection = EVERYTHING
 ) -> SweepTable:
-    from memmlp.report.tables.build_table import (
-        find_finished_runs,
-        make_run_finder,
-        make_state_finder,
-        make_table,
-        restrict_and_group_clips,
-    )
+    from memmlp.report.tables.build_table import make_state_finder, make_table, restrict_and_group_clips
 
-    sweep, plan, rounds, flags = shown
+    sweep, plan, rounds, _ = shown
     if rounds and (selection.source or selection.together or selection.weigh_groups):
         options = "--source, --together, --weigh-groups"
         raise InputError(f"{options}: cannot be combined with --until-decided")
-    runs = find_finished_runs(sweep, make_run_finder(plan, read))
-    if selection.untrained:
-        from memmlp.config.untrained_costs import measure_untrained_variants
-
-        runs, measured = measure_untrained_variants(sweep, runs)
-        flags = (*flags, *measured)
+    runs, flags = find_shown_runs(shown, selection.untrained)
     sweep, runs, restricted = restrict_and_group_clips(
         sweep, runs, selection.source, selection.together, selection.weigh_groups
     )
     command = f"{command} --until-decided" if rounds else command
     table = make_table(sweep, runs, modes, command, make_state_finder(plan), rounds)
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *restricted, *flags)))
+
+
+def find_shown_runs(shown: ShownSweep, untrained: bool) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
+    """Return a sweep's finished runs by variant and seed, and its flags. With `untrained`, networks without a
+    run are measured with random weights."""
+    from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
+    from memmlp.report.tables.measured_run import load_measured_run
+
+    runs = find_finished_runs(shown.sweep, make_run_finder(shown.plan, load_measured_run))
+    if not untrained:
+        return runs, shown.flags
+    from memmlp.config.untrained_costs import measure_untrained_variants
+
+    runs, measured = measure_untrained_variants(shown.sweep, runs)
+    return runs, (*shown.flags, *measured)
 
 
 def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
