@@ -12,6 +12,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.common.processes import (
@@ -170,21 +171,16 @@ def _beat(folder: Path) -> None:
     threading.Thread(target=touch_regularly, daemon=True).start()
 
 
-class DebugWorker:
-    """A worker inside this process. Its work is done during the first call of `alive`."""
+class DebugWorker(NamedTuple):
+    """A worker that has done its work in this process, and the returned line."""
 
-    def __init__(self, work: Work):
-        self.work: Work | None = work
-        self.line: str | None = None
+    line: str | None
 
     def alive(self) -> bool:
-        if self.work:
-            work, self.work = self.work, None
-            self.line = work()
         return False
 
     def cancel(self) -> None:
-        pass  # the work is either done or not started
+        pass
 
     def complaint(self) -> str | None:
         return self.line
@@ -196,7 +192,7 @@ class DebugExecutor:
     gpus = False
 
     def submit(self, work: Work, count: int = 1) -> list[DebugWorker]:
-        return [DebugWorker(work) for _ in range(count)]
+        return [DebugWorker(work()) for _ in range(count)]
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ from memmlp.sweep.executors.local import DebugExecutor, LocalExecutor, list_visi
 
 def test_a_debug_worker_works_in_this_process(tmp_path: Path):
     (handle,) = DebugExecutor().submit((tmp_path / "done").touch)
-    assert not handle.alive()  # it works when it is asked
     assert (tmp_path / "done").exists()
+    assert not handle.alive()
     assert handle.complaint() is None
 
 
