@@ -74,8 +74,8 @@ def _run_with_hydra(args: argparse.Namespace, train_from_config: Callable[[DictC
     """Run or print the jobs with Hydra, which reads its arguments from `sys.argv`."""
     folder = str(find_packaged_folder("conf"))
     main = hydra.main(config_path=folder, config_name=CONFIG, version_base=VERSION_BASE)
-    argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv, os.environ["HYDRA_FULL_ERROR"] = ["memmlp train", *format_hydra_arguments(args)], "1"
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    argv, sys.argv = sys.argv, ["memmlp train", *format_hydra_arguments(args)]
     try:
         main(train_from_config)()
     except Exception as error:
@@ -84,10 +84,6 @@ def _run_with_hydra(args: argparse.Namespace, train_from_config: Callable[[DictC
         raise
     finally:
         sys.argv = argv
-        if full_error is None:
-            del os.environ["HYDRA_FULL_ERROR"]
-        else:
-            os.environ["HYDRA_FULL_ERROR"] = full_error
 
 
 def _check_prediction_folders(jobs: Sequence[DictConfig]) -> None:
