@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import PATH, add_run_options, check_runs_exist, device_option
+from memmlp.cli.options import PATH, add_run_options, device_option
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.common.text_formats import make_console, make_override
@@ -39,7 +39,7 @@ def evaluate(
     export.precision=int8. Missing results are measured without training. To measure a shipped network, set
     data.root to the folder of its data.
     """
-    check_runs_exist(outputs, run)
+    found = find_run(outputs, run)
     if json_path is not None and not json_path.absolute().parent.is_dir():
         raise InputError(f"--json {json_path}: must be a file in an existing folder")
     if save_predictions is not None and save_predictions.exists() and not save_predictions.is_dir():
@@ -51,7 +51,6 @@ def evaluate(
     from memmlp.training.request import read_clip_rows, read_results
     from memmlp.training.run_stages import complete_stages
 
-    found = find_run(outputs, run)
     if find_shipped(run):
         run = str(copy_shipped(found, outputs).folder)
     opened = open_run(outputs, run, device, overrides)

@@ -179,9 +179,13 @@ class ProfileConfig:
     latency_steps: int = setting(at_least(1))
 
 
-def _coordinates() -> Rule:
-    words = "heading, head_relative or world, or coordinates that a plugin declares"
-    return Rule(words, lambda value: value in list_component_names("coordinates"))
+COORDINATES = Rule(
+    "heading, head_relative or world, or coordinates that a plugin declares",
+    lambda value: value in list_component_names("coordinates"),
+)
+METRIC = Rule(
+    "one of the metrics that plugins=[NAME] declare", lambda value: value in list_component_names("metric")
+)
 
 
 @dataclass
@@ -193,7 +197,7 @@ class NormalizerConfig:
 
     # heading: rotated by the head's heading; head_relative: horizontal positions relative to the head; world:
     # world coordinates (docs/readings.md, no. 20)
-    coordinates: str = setting(_coordinates(), "heading", literal="world")
+    coordinates: str = setting(COORDINATES, "heading", literal="world")
     # true: normalise by mean and deviation of the training clips (docs/readings.md, no. 20)
     z_scores: bool = setting(None, True, literal=False)
     # true: inputs are not normalised, only the motion; null or false: both are
@@ -228,11 +232,6 @@ class VQVAEConfig:
     weight_decay: float = setting(at_least(0), 1e-4)
 
 
-def _metrics() -> Rule:
-    words = "one of the metrics that plugins=[NAME] declare"
-    return Rule(words, lambda value: value in list_component_names("metric"))
-
-
 @dataclass
 class EvaluationConfig:
     """The evaluation of a trained network on the test clips."""
@@ -246,7 +245,7 @@ class EvaluationConfig:
     ik: str = setting(one_of("off", "lbfgs", "arms"), "off", literal="lbfgs")
     ik_iterations: int = setting(at_least(1), 15)  # maximum number of lbfgs iterations per frame (App. A)
     # paths of custom metrics (docs/guides/components.md)
-    metrics: list[str] = setting(each(_metrics(), empty=True), [])
+    metrics: list[str] = setting(each(METRIC, empty=True), [])
     # the repository whose released test is measured, too, as the branch "authors"
     # (docs/guides/published-weights.md)
     metric_set: str | None = setting(one_of(*METRIC_SETS), None)

@@ -18,7 +18,6 @@ axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, in which each var
 axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or several grids
 """
 
-import difflib
 import itertools
 import math
 import re
@@ -29,7 +28,7 @@ from typing import Any
 
 import yaml
 
-from memmlp.common.errors import InputError, describe_read_error, escape_line_breaks
+from memmlp.common.errors import InputError, describe_read_error, escape_line_breaks, suggest
 from memmlp.common.overrides import format_value
 from memmlp.common.schema import parse_config_yaml
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
@@ -198,10 +197,9 @@ def _parse_mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[s
         raise InputError(f"{name}: {_show_value(value)}; expected a mapping")
     for key in value:
         if keys and key not in keys:
-            near = difflib.get_close_matches(str(key), keys, n=1)
-            hint = f"did you mean {near[0]}? " if near else ""
             where = "" if name == "the file" else f"{name}."
-            raise InputError(f"{where}{key}: no such key; {hint}expected one of {', '.join(keys)}")
+            expected = f"{suggest(str(key), keys)}expected one of {', '.join(keys)}"
+            raise InputError(f"{where}{key}: no such key; {expected}")
     return value
 
 

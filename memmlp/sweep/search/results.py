@@ -98,8 +98,7 @@ def compute_importances(study: optuna.Study) -> list[tuple[str, float]]:
     if len(complete) < ENOUGH_TRIALS or len(complete[0].params) < 2:
         return []
     target = None if len(study.directions) == 1 else (lambda trial: trial.values[0])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         evaluator = PedAnovaImportanceEvaluator()  # Optuna's other evaluators need scikit-learn
         importances = optuna.importance.get_param_importances(study, evaluator=evaluator, target=target)
     return sorted(importances.items(), key=lambda item: -item[1])

@@ -54,8 +54,7 @@ class Study:
             goals = [StudyDirection.MINIMIZE] * len(search.objectives)
             study = optuna.create_study(storage=storage, study_name=name, pruner=pruner, directions=goals)
         if study.metric_names is None:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ExperimentalWarning)
+            with warnings.catch_warnings(action="ignore", category=ExperimentalWarning):
                 study.set_metric_names([objective.text for objective in search.objectives])
         for values in search.list_first_trials():
             study.enqueue_trial(values, skip_if_exists=True)
@@ -115,8 +114,7 @@ class Study:
         named = zip(self.search.objectives, means, strict=True)
         if names := [objective.text for objective, mean in named if math.isnan(mean)]:
             trial.set_user_attr("reason", f"{' and '.join(names)} is NaN")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             self.study.tell(trial.number, means, skip_if_finished=True)
 
     def fail(self, trial: Trial, reason: str) -> None:
@@ -142,7 +140,7 @@ class FencedJournal(JournalFileBackend):
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
         """Append lines to the journal. Raises LeaseLost if another process now owns its folder."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
-        with naming_file(Path(self.path)), open(self.path, "ab") as file:
+        with naming_file(self.path), open(self.path, "ab") as file:
             check_owner(self.path)  # after opening, because `repair_journal` of a later owner replaces it
             file.write(lines.encode())
             file.flush()
@@ -162,8 +160,7 @@ def open_storage(url: str | None, folder: Path) -> BaseStorage:
     path = journal_path(folder)
     check_journal(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ExperimentalWarning)
+        with warnings.catch_warnings(action="ignore", category=ExperimentalWarning):
             return JournalStorage(FencedJournal(path))
     except (ValueError, KeyError, TypeError) as error:
         raise _make_damage_error(path, error) from None
@@ -203,8 +200,7 @@ def make_sampler(search: Search, number: int, key: int = 0) -> optuna.samplers.B
     seed = int(np.random.SeedSequence([search.seed, number, key]).generate_state(1)[0])
     if search.startup is None or search.sampler != "tpe":  # the trials of a grid already have values
         return optuna.samplers.RandomSampler(seed=seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ExperimentalWarning)
+    with warnings.catch_warnings(action="ignore", category=ExperimentalWarning):
         return optuna.samplers.TPESampler(
             seed=seed, n_startup_trials=search.startup, multivariate=True, constant_liar=True
         )
