@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -211,7 +212,7 @@ def find_shown_runs(shown: ShownSweep, untrained: bool) -> tuple[dict[str, RunsB
     from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
     from memmlp.report.tables.measured_run import load_measured_run
 
-    runs = find_finished_runs(shown.sweep, make_run_finder(shown.plan, load_measured_run))
+    runs = find_finished_runs(shown.sweep, make_run_finder(shown.plan, functools.cache(load_measured_run)))
     if not untrained:
         return runs, shown.flags
     from memmlp.config.untrained_costs import measure_untrained_variants
