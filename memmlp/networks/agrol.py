@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, cast
 
 import torch
@@ -21,11 +22,7 @@ from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import Diffusion, PosteriorDiffusion
 from memmlp.networks.layers import MLPBlock
-from memmlp.networks.motion_model import (
-    State,
-    TrainingOutputs,
-    WindowModel,
-)
+from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
 from memmlp.networks.settings import NetworkSettings, Release, make_strided_times
 from memmlp.networks.streaming import StemGraph, make_linear
 
@@ -157,14 +154,11 @@ class AGRoLDiffusionGraph(StemGraph):
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
         """Draw a sample; the denoiser's last call computes only the newest frame (1, 132)."""
-        diffusion, (noisy, *further) = self.model.diffusion, self.model.noise
-        for index in range(len(diffusion.times) - 1):
-            clean = self._denoise_newest(noisy, window, index, self.frames)
-            noisy = diffusion.step(noisy, clean, index, further[index] if further else None)
-        return self._denoise_newest(noisy, window, len(diffusion.times) - 1, 1)
+        first, *further = self.model.noise
+        return self.model.diffusion.sample(partial(self._denoise, window), first, further)
 
-    def _denoise_newest(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Tensor:
-        """Predict the newest `count` clean rotations at sampling step `index` from noisy ones (T, 132)."""
+    def _denoise(self, window: Tensor, noisy: Tensor, index: int) -> Tensor:
+        count = 1 if index + 1 == self.model.diffusion.calls else self.frames
         h = window + self.noisy(noisy)
         *earlier, last = zip(self.blocks, self.shifts[index], strict=True)
         for block, shift in earlier:
@@ -277,7 +271,7 @@ class AGRoLDiffusion(WindowModel):
         """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
         first, *further = self.noise
         return self.diffusion.sample(
-            lambda noisy, time: self.denoise(noisy, time, encoded),
+            lambda noisy, index: self.denoise(noisy, self.diffusion.find_times(index, noisy), encoded),
             first.expand(len(encoded), -1, -1),
             further,
         )

@@ -230,7 +230,7 @@ class BoDiffusion(WindowModel):
 
     def step(self, noisy: Tensor, encoded: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Return mean and variance (B, T, 132) after a sampling step, given motion and inputs (B, T, 54)."""
-        time = torch.full((len(noisy),), self.diffusion.times[index], device=noisy.device)
+        time = self.diffusion.find_times(index, noisy)
         return self.diffusion.step(noisy, self.denoise(noisy, time, encoded), index, self.compute_limits())
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:

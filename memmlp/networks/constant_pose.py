@@ -17,11 +17,7 @@ from memmlp.common.settings import at_least, setting, tuned
 from memmlp.motion.body import N_JOINTS, ROTATION
 from memmlp.motion.geometry import matrix_to_sixd
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.motion_model import (
-    FrameGraph,
-    State,
-    WindowlessModel,
-)
+from memmlp.networks.motion_model import FrameGraph, State, WindowlessModel
 from memmlp.networks.settings import NetworkSettings
 
 

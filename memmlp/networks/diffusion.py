@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from memmlp.common import distributed
 from memmlp.networks.settings import make_strided_times
 
-Denoise = Callable[[Tensor, Tensor], Tensor]
+Denoise = Callable[[Tensor, int], Tensor]
+"""Maps a noisy signal (B, ...) at a sampling step to an estimate of the clean signal."""
 
 
 def make_cosine_schedule(steps: int) -> Tensor:
@@ -61,6 +62,10 @@ class NoiseProcess(nn.Module):
         """
         return [self.steps * (i + 1) // count - 1 for i in reversed(range(count))]
 
+    def find_times(self, index: int, noisy: Tensor) -> Tensor:
+        """Return the diffusion times (B,) of noisy signals (B, ...) at sampling step `index`, from 0."""
+        return torch.full((len(noisy),), self.times[index], device=noisy.device)
+
     def draw_times(self, clean: Tensor) -> Tensor:
         """Draw a time (B,) for each signal of a batch (B, ...)."""
         return torch.randint(self.steps, (len(clean),), device=clean.device)
@@ -107,13 +112,14 @@ class Diffusion(NoiseProcess):
         """Sample the clean signal (B, ...) by deterministic DDIM (Song et al. 2021, Eq. 12, eta = 0).
 
         Args:
-            denoise: maps a noisy signal (B, ...) and times (B,) to an estimate of the clean signal.
+            denoise: maps a noisy signal (B, ...) and the index of a sampling step to an estimate of the clean
+                signal.
             noise: the noise (B, ...) to start from.
             further: the noise of further draws (`noise_draws`), which broadcasts to the signal.
         """
         x = noise
-        for index, time in enumerate(self.times[: self.calls]):
-            clean = denoise(x, torch.full((len(x),), time, device=x.device))
+        for index in range(self.calls):
+            clean = denoise(x, index)
             is_last = index + 1 == len(self.times)
             x = clean if is_last else self.step(x, clean, index, further[index] if further else None)
         return x

@@ -3,7 +3,7 @@
 Its parts are trained one after the other (memmlp.training.train_sage), and then together.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -105,29 +105,17 @@ class SAGENetGraph(StemGraph):
 
     def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
         for_upper, for_lower, for_decoder = window.split(self.widths, -1)
-        upper = self.sample(self.upper, for_upper, self.noises[0], lambda noisy: noisy)
-        lower = self.sample(
-            self.lower, for_lower, self.noises[1], lambda noisy: self.beside(torch.cat([upper, noisy], -1))
+        seen = self.upper.condition(for_upper)
+        upper = self.diffusion.sample(lambda noisy, index: self.upper(noisy, seen, index), self.noises[0])
+        both = self.lower.condition(for_lower)
+        lower = self.diffusion.sample(
+            lambda noisy, index: self.lower(self.beside(torch.cat([upper, noisy], -1)), both, index),
+            self.noises[1],
         )
         shortened = self.decoder.condition.shorten(for_decoder)
         h = self.decoder.stem(torch.cat([shortened, upper, lower], -1))
         newest = self.decoder.stack.predict_last(h, self.places)
         return torch.cat([head(newest) for head in self.decoder.heads], -1)
-
-    def sample(
-        self,
-        sampler: DenoiserAtSamplingTimes,
-        seen: Tensor,
-        noise: Tensor,
-        merge_latents: Callable[[Tensor], Tensor],
-    ) -> Tensor:
-        """Sample latents (T // 2, 384) from noise, given the denoiser's carried window features (T, d)."""
-        condition, noisy = sampler.condition(seen), noise
-        for index in range(self.diffusion.calls):
-            clean = sampler(merge_latents(noisy), condition, index)
-            is_last = index + 1 == len(self.diffusion.times)
-            noisy = clean if is_last else self.diffusion.step(noisy, clean, index)
-        return noisy
 
 
 @component("model", "sage", builds="SAGENet")
@@ -244,7 +232,9 @@ class SAGENet(NewestFrameModel):
         """Sample the upper half's latents (B, T // 2, 384) for inputs (B, T, 54)."""
         condition = self.upper.condition(encoded)
         return self.diffusion.sample(
-            lambda noisy, time: self.upper.denoise(noisy, time, condition),
+            lambda noisy, index: self.upper.denoise(
+                noisy, self.diffusion.find_times(index, noisy), condition
+            ),
             self.noises[0].expand(len(encoded), -1, -1),
         )
 
@@ -252,7 +242,9 @@ class SAGENet(NewestFrameModel):
         """Sample the lower half's latents for inputs (B, T, 54) and upper latents (B, T // 2, 384)."""
         condition = self.lower.condition(encoded)
         return self.diffusion.sample(
-            lambda noisy, time: self.lower.denoise(self.lower.merge_latents(noisy, upper), time, condition),
+            lambda noisy, index: self.lower.denoise(
+                self.lower.merge_latents(noisy, upper), self.diffusion.find_times(index, noisy), condition
+            ),
             self.noises[1].expand(len(encoded), -1, -1),
         )
 

@@ -21,7 +21,7 @@ def test_ddim_is_an_independent_numpy_computation(steps):
     """The denoiser is an affine map of the noisy signal and the time."""
     diffusion = Diffusion(20, steps).double()
     noise = np.random.default_rng(0).normal(size=(2, 4, 3))
-    found = diffusion.sample(lambda x, t: 0.7 * x + 0.1 + 0.01 * t[:, None, None], torch.tensor(noise))
+    found = diffusion.sample(lambda x, i: 0.7 * x + 0.1 + 0.01 * diffusion.times[i], torch.tensor(noise))
     level = np.cos((np.arange(21) / 20 + 0.008) / 1.008 * np.pi / 2) ** 2
     betas = np.minimum(1 - level[1:] / level[:-1], 0.999)
     alphas = np.cumprod(1 - betas)
