@@ -12,18 +12,7 @@ from torch import Tensor, nn
 
 from memmlp.common.components import component
 from memmlp.common.settings import at_least, fraction, setting, tuned
-from memmlp.motion.body import (
-    HEAD,
-    N_JOINTS,
-    POSITION,
-    ROTATION,
-    SPARSE_ANGULAR_VELOCITY,
-    SPARSE_DIM,
-    SPARSE_POSITION,
-    SPARSE_ROTATION,
-    SPARSE_VELOCITY,
-    TRACKED,
-)
+from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.geometry import (
     complete_columns,
     convert_almost_rotations,
@@ -31,6 +20,7 @@ from memmlp.motion.geometry import (
     matrix_to_sixd,
 )
 from memmlp.motion.normalizer import Normalizer, use_float32
+from memmlp.networks.layers import replace_joints, split_by_feature
 from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
 from memmlp.networks.settings import NetworkSettings, Release, name_encoder
 from memmlp.networks.streaming import StemGraph
@@ -41,12 +31,11 @@ UNTRACKED_FEATURE = 0.01  # stands in all features of joints without a tracker
 TOKENS = 2 * N_JOINTS + 1  # positions, rotations, and the inputs as a whole
 MAX_EMBEDDED_FRAMES = 200  # frames that have a place of their own, as published
 GROUPS = 8  # of the regressor's normalisation
-TRACKER_FEATURES = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
 
 
 def group_by_tracker(encoded: Tensor) -> Tensor:
     """Return inputs (..., 54) grouped by tracker (..., 3, 18)."""
-    return torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in TRACKER_FEATURES], -1)
+    return torch.cat(split_by_feature(encoded), -1)
 
 
 def spread_over_joints(encoded: Tensor) -> Tensor:
@@ -56,14 +45,6 @@ def spread_over_joints(encoded: Tensor) -> Tensor:
     seen = dict(zip(TRACKED, trackers.split(1, -2), strict=True))
     rows = [seen.get(joint, unseen) for joint in range(N_JOINTS)]
     return torch.cat(rows, -2).flatten(-2)
-
-
-def replace_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
-    """Return joint features (..., 22, n) with the tracked joints replaced by `tracked` (..., 3, n)."""
-    rows = list(joints.unbind(-2))
-    for joint, row in zip(TRACKED, tracked.unbind(-2), strict=True):
-        rows[joint] = row
-    return torch.stack(rows, -2)
 
 
 def apply_to_batch(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
@@ -245,9 +226,9 @@ class AvatarJLM(WindowModel):
         embedded = self.embedding(spread_over_joints(encoded))
         positions, rotations = self.place_coarse_joints(embedded)
         seen = encoded * self.normalizer.std[:SPARSE_DIM] + self.normalizer.mean[:SPARSE_DIM]
-        tracked = [seen[..., part].unflatten(-1, (len(TRACKED), -1)) for part in TRACKER_FEATURES]
-        positions = replace_tracked(positions, tracked[2] - tracked[2][..., :1, :])
-        rotations = replace_tracked(rotations, tracked[0])
+        tracked_rotations, _, places, _ = split_by_feature(seen)
+        positions = replace_joints(positions, TRACKED, places - places[..., :1, :])
+        rotations = replace_joints(rotations, TRACKED, tracked_rotations)
         whole = self.input_token(embedded.detach())[..., None, :]
         return torch.cat([self.position_token(positions), self.rotation_token(rotations), whole], -2)
 
@@ -296,6 +277,6 @@ class AvatarJLM(WindowModel):
         joints = true_positions.unflatten(-1, (N_JOINTS, 3))
         joints = joints - joints[..., HEAD : HEAD + 1, :]
         if self.coarse_untracked:
-            coarse_joints = replace_tracked(coarse_joints, joints[..., list(TRACKED), :])
+            coarse_joints = replace_joints(coarse_joints, TRACKED, joints[..., list(TRACKED), :])
         error = coarse_joints - joints
         return {"coarse": self.coarse_weight * error.abs().mean()}

@@ -19,16 +19,10 @@ from torch import Tensor, nn
 
 from memmlp.common.components import component
 from memmlp.common.settings import at_least, fraction, setting, tuned
-from memmlp.motion.body import (
-    ROTATION,
-    SPARSE_ANGULAR_VELOCITY,
-    SPARSE_POSITION,
-    SPARSE_ROTATION,
-    SPARSE_VELOCITY,
-    TRACKED,
-)
+from memmlp.motion.body import ROTATION, TRACKED
 from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer, use_float32
+from memmlp.networks.layers import split_by_feature
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
 from memmlp.networks.settings import NetworkSettings, Release, name_encoder
 from memmlp.networks.transformer import make_encoder
@@ -40,12 +34,6 @@ RELEASED_ORDER = (0, 1, 2, 6, 7, 3, 4, 5)  # the place of each token in the rele
 
 # On a GPU cuDNN copies an LSTM's weights into one piece: at each call, since they are computed at each call.
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
-
-
-def split_by_feature(sparse: Tensor) -> list[Tensor]:
-    """Split inputs (..., 54) by feature, each (..., 3 trackers, n)."""
-    parts = SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY
-    return [sparse[..., part].unflatten(-1, (len(TRACKED), -1)) for part in parts]
 
 
 def convert_hands_to_head_frame(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,33 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
 
 from memmlp.common import distributed
+from memmlp.motion.body import (
+    SPARSE_ANGULAR_VELOCITY,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+    SPARSE_VELOCITY,
+    TRACKED,
+)
+
+FEATURES = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
+
+
+def split_by_feature(sparse: Tensor) -> list[Tensor]:
+    """Split inputs (..., 54) by feature, each (..., 3 trackers, n)."""
+    return [sparse[..., part].unflatten(-1, (len(TRACKED), -1)) for part in FEATURES]
+
+
+def select_joints(joints: Tensor, which: Sequence[int], axis: int = -2) -> Tensor:
+    """Return a tensor's entries for the joints `which`. The backward is quicker than that of indexing."""
+    return joints.index_select(axis, torch.tensor(which, device=joints.device))
+
+
+def replace_joints(joints: Tensor, which: Sequence[int], values: Tensor, axis: int = -2) -> Tensor:
+    """Return a tensor with other values for the joints `which`."""
+    rows = list(joints.unbind(axis))
+    for joint, row in zip(which, values.unbind(axis), strict=True):
+        rows[joint] = row
+    return torch.stack(rows, axis)
 
 
 def take_newest(h: Tensor, count: int) -> Tensor:

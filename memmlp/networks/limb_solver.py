@@ -8,7 +8,6 @@ The order of the four limbs in tensors is left arm, right arm, left leg, right l
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from memmlp.motion.body import HEAD, PARENTS, SPARSE_POSITION, SPARSE_ROTATION
 from memmlp.motion.geometry import matrix_to_wxyz
+from memmlp.networks.layers import replace_joints, select_joints
 
 BASES, MIDDLES, ENDS = (16, 17, 1, 2), (18, 19, 4, 5), (20, 21, 7, 8)
 ANKLES, TOES = ENDS[2:], (10, 11)
@@ -26,20 +26,14 @@ MAX_TWIST = (90.0, 90.0, 40.0, 40.0)
 SKEW = ((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0))
 """The contribution of each vector component to the 3 x 3 cross-product matrix, row by row."""
 IDENTITY = ((1.0, 0, 0), (0, 1, 0), (0, 0, 1))
-STRAIGHT_MARGIN = (
-    5e-4  # from 1, of the cosine of the least bend, 1.8 degrees: on a straighter limb rounding is seen
-)
+# From 1, of the cosine of the least bend, 1.8 degrees: on a straighter limb rounding is visible.
+STRAIGHT_MARGIN = 5e-4
 OFFSET = 1e-3  # metres; which way a limb bends that is straighter than that follows from its axis of flexion
 
 
 def dot(one: Tensor, other: Tensor) -> Tensor:
     """Return the dot products (..., 1) of vectors (..., 3)."""
     return (one * other).sum(-1, keepdim=True)
-
-
-def select_joints(joints: Tensor, which: Sequence[int], axis: int = -2) -> Tensor:
-    """Return a tensor's entries for the joints `which` along an axis."""
-    return joints.index_select(axis, torch.tensor(which, device=joints.device))
 
 
 def make_cross_matrices(vector: Tensor) -> Tensor:
@@ -229,22 +223,16 @@ def solve_limbs(
     goal = rotate(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
     foot = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1).expand(goal.shape)
     ankles = find_aligning_rotations(foot, goal)
-    middles = torch.cat([bent[..., :2, :, :] @ rolled, bent[..., 2:, :, :]], -3)
-    rows = list(local.unbind(-3))
-    groups = ((BASES, bases), (MIDDLES, middles), (ENDS, torch.cat([wrists, ankles], -3)))
-    for joints, rotations in groups:
-        for joint, rotation in zip(joints, rotations.unbind(-3), strict=True):
-            rows[joint] = rotation
-    return torch.stack(rows, -3)
+    limbs = torch.cat([bases, bent[..., :2, :, :] @ rolled, bent[..., 2:, :, :], wrists, ankles], -3)
+    return replace_joints(local, (*BASES, *MIDDLES, *ENDS), limbs, -3)
 
 
 SHOULDERS, ELBOWS, WRISTS = (slice(left, right + 1) for left, right, *_ in (BASES, MIDDLES, ENDS))
 """The joints of both arms, which are the body's last joints, as slices."""
 BONE_STARTS, BONE_ENDS = slice(SHOULDERS.start, ELBOWS.stop), slice(ELBOWS.start, WRISTS.stop)
 """The joints where the arms' bones begin and end: upper bones, then lower bones."""
-REACH_MARGIN = (
-    1e-3  # the part of its reach by which an arm is never quite straight, nor folded: so it has a side
-)
+# The part of its reach by which an arm is never quite straight, nor folded: so it has a side.
+REACH_MARGIN = 1e-3
 
 
 def use_tracker_rotations(rotations: Tensor, sparse: Tensor) -> Tensor:

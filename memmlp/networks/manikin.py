@@ -36,6 +36,7 @@ from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.normalizer import Normalizer, use_float32
 from memmlp.networks.avatar_jlm import AvatarJLM, AvatarJLMGraph, AvatarJLMSettings
 from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserGraph, AvatarPoserSettings, make_head
+from memmlp.networks.layers import replace_joints, select_joints
 from memmlp.networks.limb_solver import (
     ANKLES,
     BASES,
@@ -45,7 +46,6 @@ from memmlp.networks.limb_solver import (
     TOES,
     measure_swivels,
     place_middle,
-    select_joints,
     solve_limbs,
 )
 from memmlp.networks.motion_model import MotionModel, State, TrainingOutputs
@@ -105,11 +105,8 @@ class PredictedParts(NamedTuple):
     def trunk(self) -> Tensor:
         """The local rotations (..., 22, 3, 3) of a body; joints without a prediction have the identity."""
         rotations = sixd_to_matrix(self.sixd)
-        identity = rotations.new_tensor(IDENTITY).expand(rotations[..., 0, :, :].shape)
-        rows = [identity] * N_JOINTS
-        for joint, rotation in zip((ROOT, *PREDICTED_JOINTS), rotations.unbind(-3), strict=True):
-            rows[joint] = rotation
-        return torch.stack(rows, -3)
+        identity = rotations.new_tensor(IDENTITY).expand(*rotations.shape[:-3], N_JOINTS, 3, 3)
+        return replace_joints(identity, (ROOT, *PREDICTED_JOINTS), rotations, -3)
 
     def pose_body(self, rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the trunk, its global rotations (..., 22, 3, 3), and joints (..., 22, 3) from the pelvis."""
@@ -134,9 +131,9 @@ class PredictedParts(NamedTuple):
             self.toe,
             normalizer.rest,
         )
-        rows = list(local.unbind(-3))
-        rows[HEAD] = turned[..., PARENTS[HEAD], :, :].transpose(-1, -2) @ trackers[..., 0, :, :]
-        sixd = matrix_to_sixd(torch.stack(rows, -3)).flatten(-2)
+        neck = turned[..., PARENTS[HEAD] : PARENTS[HEAD] + 1, :, :]
+        head = neck.transpose(-1, -2) @ trackers[..., :1, :, :]
+        sixd = matrix_to_sixd(replace_joints(local, [HEAD], head, -3)).flatten(-2)
         return (sixd - normalizer.mean[SPARSE_DIM:][ROTATION]) / normalizer.std[SPARSE_DIM:][ROTATION]
 
 

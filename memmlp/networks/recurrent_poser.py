@@ -281,10 +281,8 @@ class RecurrentPoserSettings(NetworkSettings):
     def problems(cls, config: Any) -> Iterator[str]:
         """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
-        reaching = (
-            config["model"]["output"] == "reaching" and config["refiner"] is None
-        )  # a refiner moves arms again
-        if config["evaluation"]["ik"] == "arms" and reaching:
+        output, ik = config["model"]["output"], config["evaluation"]["ik"]
+        if ik == "arms" and output == "reaching" and config["refiner"] is None:  # a refiner moves arms again
             yield "evaluation.ik=arms: must be off, since model.output=reaching already moves the arms"
 
 

@@ -150,9 +150,8 @@ class RPM(WindowlessModel):
         future = motion.new_zeros(len(motion), self.horizon, ROTATION.stop)
         queries = self.motion(torch.cat([motion, future], 1)) + self.places
         seen = self.sparse(encoded) + self.places[: encoded.shape[1]]
-        h = self.norm(queries + self.attention(queries, seen)).squeeze(
-            0
-        )  # without a batch axis, a live step has plain layers
+        h = self.norm(queries + self.attention(queries, seen))
+        h = h.squeeze(0)  # without a batch axis, a live step has plain layers
         for layer in self.layers:
             h = layer(h)
         return self.head(h[..., -self.horizon :, :]).view(future.shape)

@@ -106,16 +106,11 @@ class NetworkSettings(Settings):
         calls, steps = model.get("sampling_steps", 1), model.get("diffusion_steps", 1)
         if calls > steps:
             yield f"model.sampling_steps={calls}: must be at most model.diffusion_steps={steps}"
-        needed = cls.prerequisite_option()
+        needed = cls.defaults.get("prerequisite")
         if needed is None and config["prerequisite"] is not None:
             yield f"prerequisite={config['prerequisite']['name']}: must be null with model={name}"
         if needed and (config["prerequisite"] is None or config["prerequisite"]["name"] != needed):
             yield f"prerequisite: must be {needed} with model={name}"
-
-    @classmethod
-    def prerequisite_option(cls) -> str | None:
-        """Return the option of `prerequisite` that the network needs; None without a prerequisite."""
-        return cls.defaults.get("prerequisite")
 
 
 def _find_offline_conflicts(config: Any) -> Iterator[str]:

@@ -1,6 +1,5 @@
 """The baselines' losses, as in their released code, and an empty loss for networks with their own losses."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,19 +10,7 @@ from memmlp.common.settings import at_least, one_of, setting
 from memmlp.motion.body import N_JOINTS, ROOT, ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import CompleteLossSettings, FixedWeights, Loss, Terms, joints, read_weights
-from memmlp.training.losses.terms import Comparison
-
-ERRORS: dict[str, Callable[[Tensor], Tensor]] = {
-    "norm": lambda error: error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean(),
-    "square": lambda error: error.square().mean(),
-}
-"""Functions that reduce AGRoL's 6D errors (..., 132) to a number."""
-
-ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {
-    "pelvis": lambda positions: positions - positions[..., ROOT : ROOT + 1, :],
-    "head": lambda positions: positions,
-}
-"""Functions that anchor joint positions (..., 22, 3) for comparison; the head is on its tracker."""
+from memmlp.training.losses.terms import ERRORS, Comparison
 
 
 @component("loss", "agrol", builds="AGRoLLoss")
@@ -50,7 +37,7 @@ class AGRoLLoss(Loss):
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         origin = normalizer.find_origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
-        return {"rotation_all": self.error(error[..., ROTATION])}
+        return {"rotation_all": self.error(error[..., ROTATION].unflatten(-1, (N_JOINTS, 6)))}
 
 
 @component("loss", "avatar_poser", builds="AvatarPoserLoss")
@@ -74,15 +61,17 @@ class AvatarPoserLoss(Loss):
     def __init__(self, settings: AvatarPoserLossSettings | None = None):
         super().__init__()
         settings = settings or AvatarPoserLossSettings()
-        self.weighting, self.anchored = FixedWeights(read_weights(settings)), ANCHORS[settings.anchor]
+        self.weighting, self.anchor = FixedWeights(read_weights(settings)), settings.anchor
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         error = (motion - truth)[..., ROTATION].abs()
-        position = self.anchored(normalizer.compute_positions(motion, sparse)) - self.anchored(joints(truth))
+        predicted, true = normalizer.compute_positions(motion, sparse), joints(truth)
+        if self.anchor == "pelvis":
+            predicted, true = (one - one[..., ROOT : ROOT + 1, :] for one in (predicted, true))
         return {
             "orientation": error[..., :6].mean(),
             "rotation": error[..., 6:].mean(),
-            "position": position.abs().mean(),
+            "position": (predicted - true).abs().mean(),
         }
 
 

@@ -1,6 +1,6 @@
 """The interface of losses: terms by name, and how they are weighted."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import ClassVar
 
@@ -19,11 +19,6 @@ Terms = dict[str, Tensor]
 def joints(motion: Tensor) -> Tensor:
     """Return the joint positions (B, T, 22, 3) of motion (B, T, 198)."""
     return motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
-
-
-def select_joints(positions: Tensor, indices: Sequence[int]) -> Tensor:
-    """Return some joints (B, T, n, 3) of (B, T, 22, 3). Its backward is quicker than that of indexing."""
-    return positions.index_select(2, torch.tensor(indices, device=positions.device))
 
 
 def read_weights(settings: Settings) -> dict[str, float]:

@@ -17,7 +17,8 @@ from memmlp.common.settings import Settings
 from memmlp.motion.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.training.losses.loss import Loss, Terms, Weighting, joints, select_joints
+from memmlp.networks.layers import select_joints
+from memmlp.training.losses.loss import Loss, Terms, Weighting, joints
 
 
 def l1(error: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ from memmlp.motion.geometry import (
     sixd_to_matrix,
 )
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import select_joints
 from memmlp.training.losses.loss import (
     CompleteLossSettings,
     FixedWeights,
@@ -31,7 +32,6 @@ from memmlp.training.losses.loss import (
     UncertaintyWeights,
     Weighting,
     joints,
-    select_joints,
 )
 
 FEET = (7, 8, 10, 11)  # both ankles, both toes
