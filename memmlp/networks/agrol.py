@@ -207,7 +207,6 @@ class AGRoLDiffusionSettings(AGRoLMLPSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
         model = config["model"]
         if model["width"] % 2:
@@ -268,7 +267,6 @@ class AGRoLDiffusion(WindowModel):
         return self.head(h)
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
-        """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
         first, *further = self.noise
         return self.diffusion.sample(
             lambda noisy, index: self.denoise(noisy, self.diffusion.find_times(index, noisy), encoded),

@@ -140,7 +140,6 @@ class AvatarJLMSettings(NetworkSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
         if config["model"]["width"] % 4:
             yield f"model.width={config['model']['width']}: must be a multiple of 4 with this model"

@@ -203,7 +203,6 @@ class EgoPoserSettings(AvatarPoserSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
         normalizer = config["normalizer"]
         if normalizer["z_scores"] and normalizer["coordinates"] == "world":

@@ -153,7 +153,6 @@ class BoDiffusionSettings(NetworkSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
         if config["loss"]["name"] == "of_network" and not config["model"]["noise_weight"]:
             yield "model.noise_weight=0: must be above 0 with loss=of_network"
@@ -234,7 +233,6 @@ class BoDiffusion(WindowModel):
         return self.diffusion.step(noisy, self.denoise(noisy, time, encoded), index, self.compute_limits())
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
-        """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
 
         def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
             mean, variance = self.step(noisy, encoded, index)

@@ -153,7 +153,6 @@ class StridedDiffusion(Diffusion):
 
     @property
     def calls(self) -> int:
-        """The number of denoiser calls for a sample."""
         return len(self.times) - 1
 
 
@@ -180,7 +179,6 @@ class PosteriorDiffusion(Diffusion):
         return len(self.times)
 
     def step(self, x: Tensor, clean: Tensor, index: int, noise: Tensor | None = None) -> Tensor:
-        """Take one sampling step; see Diffusion."""
         first, second, log_variance, _ = self.posterior[:, index]
         assert noise is not None
         return first * clean + second * x + (log_variance / 2).exp() * noise

@@ -176,7 +176,6 @@ class MemMLPSettings(Settings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the network cannot be used; see Settings."""
         for slot, words in (
             ("memory", ", or none for no memory"),
             ("predictor", ""),
@@ -271,28 +270,20 @@ class MemMLP(MotionModel):
 
     @property
     def past_frames(self) -> int:
-        """The number of past input frames that the memory needs in the buffer."""
         return self.memory.past_frames
 
     @property
     def frames_per_call(self) -> int:  # type: ignore[override]
-        """The maximum number of new frames in a call of `advance_frames`."""
         return self.memory.frames_per_call
 
     def count_past(self, new: int) -> int:
-        """Return how many past frames a call with this many new frames depends on."""
         return self.memory.count_past(new)
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the initial state, all zeros.
-
-        In the first call, the first frame's inputs replace all earlier inputs.
-        """
         kept = self.memory.initial_state(batch)
         return super().initial_state(batch) | {name: t.to(self.normalizer.mean) for name, t in kept.items()}
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after world frames [X | Theta] (B, past, 252), with true history."""
         sparse, motion = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:]
         origin = self.normalizer.find_origin(sparse)
         newest = self.normalizer.encode_sparse(sparse[:, -1], origin[:, -1])

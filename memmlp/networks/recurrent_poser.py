@@ -279,7 +279,6 @@ class RecurrentPoserSettings(NetworkSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
         output, ik = config["model"]["output"], config["evaluation"]["ik"]
         if ik == "arms" and output == "reaching" and config["refiner"] is None:  # a refiner moves arms again

@@ -67,7 +67,6 @@ class RefinedGraph(StreamingGraph):
         return has_streaming_graph(model.network)
 
     def build(self, model: Any) -> None:
-        """Make the network's streaming graph and keep a copy of the refiner."""
         self.model, self.hidden = model, model.initial_state(1)[HIDDEN]
         self.graph = make_streaming_graph(model.network)
         model.add_module("layers", FrameGRU(model.layers))  # of another class than the network's
@@ -119,7 +118,6 @@ class RefinedModel(MotionModel):
 
     @property
     def past_frames(self) -> int:
-        """The number of past input frames in the network's buffer."""
         return self.network.past_frames
 
     def initial_state(self, batch: int = 1) -> State:

@@ -89,7 +89,6 @@ class RPMSettings(NetworkSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
         model = config["model"]
         least = model["context"] + model["horizon"]

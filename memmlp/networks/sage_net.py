@@ -189,7 +189,6 @@ class SAGESettings(NetworkSettings):
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the network cannot be used; see Settings."""
         yield from super().problems(config)
         model = config["model"]
         for key in ("frames", "code_width"):  # its codes are of two frames each
