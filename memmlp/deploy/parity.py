@@ -25,15 +25,14 @@ MARGIN = 60  # number of frames to compare after the network's history is full
 def disable_sampling(model: nn.Module) -> Iterator[None]:
     """Replace a sampled m by its mean (docs/readings.md, no. 7), because torch and ONNX Runtime cannot use
     the same random numbers."""
-    sampled = [module for module in model.modules() if isinstance(module, Blend) and module.is_sampled]
-    values = [blend.value for blend in sampled]
+    sampled = [part for part in model.modules() if isinstance(part, Blend) and part.value == "sampled"]
+    for blend in sampled:
+        blend.value = Blend.MEAN
     try:
-        for blend in sampled:
-            blend.value = Blend.MEAN
         yield
     finally:
-        for blend, value in zip(sampled, values, strict=True):
-            blend.value = value
+        for blend in sampled:
+            blend.value = "sampled"
 
 
 def select_parity_clip(model: MotionModel, clips: Sequence[Tensor]) -> Tensor:

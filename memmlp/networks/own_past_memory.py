@@ -54,11 +54,6 @@ class Blend(nn.Module):
         super().__init__()
         self.value = value
 
-    @property
-    def is_sampled(self) -> bool:
-        """Whether m is also drawn at inference."""
-        return isinstance(self.value, str)
-
     def forward(self, like: Tensor) -> Tensor | float:
         """Return m: a number, or draws of the shape (B, T, k) of `like`."""
         if self.training or isinstance(self.value, str):
@@ -168,12 +163,7 @@ class OwnPastRecall(Recall):
 
 @dataclass
 class OwnPastMemorySettings(FeatureMemorySettings):
-    """Keys of memories that recall the network's own earlier motion.
-
-    Attributes:
-        codes: "frozen" if the VQ-VAE is trained before the network, "joint" if both are trained together, ""
-            without a VQ-VAE.
-    """
+    """Keys of memories that recall the network's own earlier motion."""
 
     # window: the past window ends T frames ago; frame: it ends one frame ago (docs/readings.md, no. 6)
     shift: str = setting(one_of("frame", "window"), "window", literal="frame")
@@ -183,6 +173,7 @@ class OwnPastMemorySettings(FeatureMemorySettings):
     # (docs/readings.md, no. 7)
     blend: int | float | str = setting(within(0, 1, "sampled"), 0.5)
 
+    # frozen: the VQ-VAE is trained before the network; joint: with the network; "": without a VQ-VAE
     codes: ClassVar[str] = ""
 
 
