@@ -60,7 +60,7 @@ def test_a_recorded_config_decides_nowhere_where_a_command_writes(trained: Run, 
         assert experiment.outputs == here
         assert experiment.motion.caches == here / "cache"
         assert experiment.motion.clips.root.parent == expected
-        assert experiment.loggers.loggers == ()
+        assert experiment.loggers == ()
         assert (experiment.config["save_predictions"], experiment.config["force"]) == (None, False)
     assert build_run_experiment(trained).outputs == trained.folder.parent.parent
     assert not victim.exists()

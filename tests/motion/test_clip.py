@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from memmlp.motion.clip import INTERPOLATIONS, Clip, resample
+from memmlp.motion.clip import LINES, SPLINES, Clip, resample
 
 
 def analytic(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -25,7 +25,7 @@ def turned(poses: np.ndarray, others: np.ndarray) -> np.ndarray:
     [(60, "kept"), (240, "every 4. frame"), (100, "interpolated"), (59.94, "interpolated"),
      (30, "interpolated")],
 )  # fmt: skip
-@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+@pytest.mark.parametrize("interpolation", [SPLINES, LINES])
 def test_resampling_is_exact(fps, how, interpolation):
     times = np.arange(int(2 * fps) + 1) / fps
     clip, said = resample(Clip("a", *analytic(times), fps), interpolation=interpolation)
@@ -56,7 +56,7 @@ def errors(fps: float, interpolation: str) -> tuple[float, float]:
 
 @pytest.mark.parametrize("fps", [24, 30, 100])
 def test_splines_are_nearer_to_smooth_motion_than_lines_and_have_its_jerk(fps):
-    (splines, jerk), (lines, kinks) = (errors(fps, name) for name in INTERPOLATIONS)
+    (splines, jerk), (lines, kinks) = (errors(fps, name) for name in (SPLINES, LINES))
     assert splines < 0.2 * lines
     assert abs(jerk - 1) < 0.15
     assert kinks > (3 if fps <= 30 else 1.4)
