@@ -31,6 +31,7 @@ from memmlp.motion.body import FRAME_DIM
 from memmlp.networks.streaming import has_streaming_graph, make_streaming_graph
 from memmlp.runs.environment import describe_environment
 
+CACHE_BYTES = 2**28  # more than a processor's caches
 SETTLING = 3  # number of untimed steps at the start of each round
 Key = TypeVar("Key", bound=Hashable)
 BASE = "avatar_poser"
@@ -56,11 +57,15 @@ class RoundTimes(NamedTuple):
     core_fractions: np.ndarray
 
 
-def time_steps_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, RoundTimes]:
+def time_steps_in_rounds(
+    paths: Mapping[Key, Path], rounds: int, steps: int, cold: bool = False
+) -> dict[Key, RoundTimes]:
     """Time the steps of exported files on one thread. Each round times all files.
 
-    The first steps of a file in each round only fill the caches, and are not counted.
+    The first steps of a file in each round only fill the caches, and are not counted. With `cold`, the caches
+    are filled with other data before each step.
     """
+    other = np.zeros(CACHE_BYTES, np.uint8)
     streams = {key: OnnxStream(path) for key, path in paths.items()}
     random = np.random.default_rng(0)
     given = {
@@ -71,6 +76,8 @@ def time_steps_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> 
     def time_round(key: Key) -> np.ndarray:
         seconds = np.zeros(SETTLING + steps)
         for step in range(len(seconds)):
+            if cold:
+                np.add(other, 1, out=other)
             start = time.perf_counter()
             streams[key].step(*given[key])
             seconds[step] = time.perf_counter() - start
@@ -116,11 +123,18 @@ def time_poses_in_rounds(paths: Mapping[Key, Path], rounds: int, steps: int) -> 
     default=DEFAULT_MODELS,
     help="Options of `model`, separated by commas. NAME@FRAMES sets model.frames, NAME+KEY=VALUE any key.",
 )
+@click.option(
+    "--cold",
+    is_flag=True,
+    help="Fill the processor's caches with other data before each step, and do not time poses.",
+)
 @click.option("--json", "file", type=PATH, help="JSON file to write the rows into.")
 @click.argument("overrides", nargs=-1)
 @config_dir_option
 @plugins_option
-def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: tuple[str, ...]) -> None:
+def latency(
+    rounds: int, steps: int, models: str, cold: bool, file: Path | None, overrides: tuple[str, ...]
+) -> None:
     """Time a step of each network.
 
     All networks run in ONNX Runtime, in turn, in one process with one thread. The command times three things:
@@ -139,10 +153,10 @@ def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: 
     if file and not file.absolute().parent.is_dir():
         raise InputError(f"--json {file}: there is no folder {file.parent}")
     with tempfile.TemporaryDirectory() as folder:
-        rows = time_all(dict(export_all(chosen, overrides, Path(folder))), rounds, steps)
+        rows = time_all(dict(export_all(chosen, overrides, Path(folder))), rounds, steps, cold)
     show(rows, rounds)
     if file:
-        how = {"overrides": list(overrides), "rounds": rounds, "steps": steps, "threads": 1}
+        how = {"overrides": list(overrides), "rounds": rounds, "steps": steps, "cold": cold, "threads": 1}
         write_json(file, {**how, "made_by": describe_environment(), "rows": rows})
 
 
@@ -167,10 +181,11 @@ def export_all(
         yield from (((name, graph), path) for graph, path in files.items() if path.exists())
 
 
-def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
-    """Time the steps of all files in turn, then the end-to-end poses of deployed files; see `summarize`."""
-    times = time_steps_in_rounds(paths, rounds, steps)
-    deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}
+def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int, cold: bool) -> list[dict[str, Any]]:
+    """Time the steps of all files in turn, then the end-to-end poses of deployed files; see `summarize`. With
+    `cold`, only the steps are timed, each with its weights out of the caches."""
+    times = time_steps_in_rounds(paths, rounds, steps, cold)
+    deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED and not cold}
     poses = time_poses_in_rounds(deployed, rounds, steps)
     return [
         {"model": key[0], "variant": key[1]}

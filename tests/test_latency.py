@@ -5,7 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.latency import GRAPHS, RoundTimes, export_all, latency, summarize, time_in_rounds
+from benchmarks.latency import (
+    GRAPHS,
+    RoundTimes,
+    export_all,
+    latency,
+    summarize,
+    time_in_rounds,
+    time_steps_in_rounds,
+)
 from memmlp.common import processes
 from memmlp.common.errors import InputError
 
@@ -36,6 +44,14 @@ def test_every_graph_is_timed_and_compared(tmp_path, capsys: pytest.CaptureFixtu
     assert rows["naive"]["pose_ratio_to_avatar_poser"] == 1
     assert [graph for graph, row in rows.items() if "pose_median_ms" in row] == list(GRAPHS[1:])
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
+
+
+@pytest.mark.long
+def test_a_step_is_slower_if_its_weights_are_not_in_the_caches(tmp_path):
+    key = ("recurrent_poser", "streaming")
+    path = dict(export_all([key[0]], ("profile=small",), tmp_path))[key]
+    warm, cold = (time_steps_in_rounds({key: path}, 1, 20, cold)[key].seconds for cold in (False, True))
+    assert np.median(cold) > 1.2 * np.median(warm)
 
 
 @pytest.mark.long
