@@ -19,6 +19,7 @@ The translation is `trans` or `transl` (N, 3). The frame rate is `mocap_framerat
 import io
 import math
 import warnings
+import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +46,7 @@ FARTHEST = 1e4  # metres from the origin
 
 MAX_ROWS = 500_000  # frames: an hour at 120 Hz is 432,000
 MAX_BYTES = 2**30  # maximum unpacked size of an array; 500,000 SMPL-X frames have 660 MB
+METHODS = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED  # NumPy's; others do not limit the unpacked size
 
 
 class NoMotionError(InputError):
@@ -122,6 +124,9 @@ def _read_array(path: Path, file: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
     """Read an array, after a check of its unpacked size."""
     assert file.zip is not None  # it is open
     info = file.zip.getinfo(f"{key}.npy")
+    if info.compress_type not in METHODS:
+        found = f"{path}: {key} has compression method {info.compress_type}"
+        raise InputError(f"{found}; must be stored or deflate")
     if info.file_size > MAX_BYTES:
         raise InputError(f"{path}: {key} has {info.file_size} bytes; must have at most {MAX_BYTES}")
     stream = io.BytesIO(file.zip.read(info))  # all bytes, so that their checksum is checked

@@ -163,6 +163,11 @@ def test_damaged_entries_are_one_line(tmp_path):
             new.writestr(name, content.replace(b"(20, ", b"(19, "))
     with pytest.raises(InputError, match=r"a\.npz: poses has more bytes than an array float64 \(19, 156\)"):
         read_clip(tmp_path / "a.npz", "a")
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_LZMA) as new:
+        for name, content in entries.items():
+            new.writestr(name, content)
+    with pytest.raises(InputError, match=r"a\.npz: .* compression method 14; must be stored or deflate"):
+        read_clip(tmp_path / "a.npz", "a")
 
 
 def peak_of_refusal(path: Path, match: str) -> int:
