@@ -18,7 +18,7 @@ import pkgutil
 import re
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
@@ -30,6 +30,7 @@ from memmlp.common.components import SLOTS, Component, add_package, collect_comp
 from memmlp.common.errors import InputError
 from memmlp.common.files import find_packaged_folder
 from memmlp.common.overrides import parse_overrides
+from memmlp.common.schema import parse_config_yaml
 from memmlp.common.settings import MetricSettings
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
 
@@ -64,8 +65,13 @@ def split_names(text: str) -> list[str]:
 
 def find_named_packages(words: Iterable[str]) -> list[str]:
     """Return the packages in overrides such as `plugins=[mine]`."""
-    lists = [one for one in parse_overrides(words) if one.key == KEY and (one.value or "").startswith("[")]
-    return [name for one in lists for name in one.options]
+    values = [one.value or "" for one in parse_overrides(words) if one.key == KEY]
+    packages: list[str] = []
+    for value in values:
+        with suppress(yaml.YAMLError):  # reported when the config is composed
+            content = parse_config_yaml(value)
+            packages += map(str, content) if isinstance(content, list) else []
+    return packages
 
 
 def list_active() -> Mapping[str, Path]:

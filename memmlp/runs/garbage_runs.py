@@ -108,7 +108,9 @@ def _list_plans(outputs: Path) -> Iterator[Path]:
 
 
 def _read_planned_ids(path: Path) -> set[str]:
-    return {task["id"] for task in read_json(path).get("tasks", ())}
+    tasks = read_json(path).get("tasks")
+    ids = [one.get("id") for one in tasks if isinstance(one, dict)] if isinstance(tasks, list) else []
+    return {one for one in ids if isinstance(one, str)}
 
 
 def _has_notes(run: Run) -> bool:

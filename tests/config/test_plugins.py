@@ -44,6 +44,13 @@ def write(folder: Path, files: dict[str, str]) -> None:
     environment._read_user_code.cache_clear()  # as in a process that starts now
 
 
+@pytest.mark.parametrize(
+    ("value", "names"), [(" [mine, 'other']", ["mine", "other"]), ("[mine", []), ("[mine],[other]", [])]
+)
+def test_packages_are_named_by_a_yaml_list(value: str, names: list[str]):
+    assert plugins.find_named_packages([f"plugins={value}", "seed=1"]) == names
+
+
 @pytest.mark.parametrize("how", ["overrides", "environment", "entry point"])
 def test_a_package_is_used_where_somebody_names_it(on_path: Path, how: str, tmp_path: Path, monkeypatch):
     if how == "environment":

@@ -71,6 +71,8 @@ def test_deleted_is_the_folder_and_no_other_unless_it_was_marked_meanwhile(outpu
     ("plan.json", '{"entries": [], "tasks": []}'),  # its data is not there
     ("plan.json", '{"entries": [{"label": "a", "seed": 1, "id": "0"}]}'),  # for another seed
     ("entries.json", "{"),
+    ("plan.json", '{"tasks": [5]}'),  # damaged
+    ("plan.json", '{"tasks": null}'),
 ])  # fmt: skip
 def test_a_plan_that_does_not_name_a_run_condemns_none(outputs: Path, file: str, content: str):
     (outputs / "sweeps" / "mine" / file).write_text(content)
