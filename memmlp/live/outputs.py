@@ -81,7 +81,7 @@ class Outputs:
     def close(self) -> None:
         """Close all outputs, even if some of them fail."""
         with ExitStack() as stack:
-            for output in self.outputs:
+            for output in reversed(self.outputs):  # the stack calls the last one first
                 stack.callback(output.close)
 
 
@@ -230,9 +230,10 @@ class Recorder:
         if not self.rows:
             self.report("recording: no frame was received, so no file is written")
             return
+        rows = np.stack(self.rows)
         with ExitStack() as stack:
-            for path in reversed(self.paths):  # the stack calls the last one first
-                stack.callback(self._write, path, np.stack(self.rows))
+            for path in reversed(self.paths):
+                stack.callback(self._write, path, rows)
 
     def _write(self, path: Path, rows: np.ndarray) -> None:
         """Write a file, and report its length, breaks and interpolated frames."""
