@@ -79,6 +79,7 @@ class PersonSplit(Split):
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Subset -> number of the split's entries."""
         return {name: len(kind.persons) for name, kind in self.kinds.items()}
 
     def find_missing_entries(self, names: Collection[str]) -> tuple[str, ...]:

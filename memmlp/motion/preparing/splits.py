@@ -287,6 +287,7 @@ class ListSplit(PublishedSplit):
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Subset -> number of the split's entries."""
         return dict(Counter(entry.split("/")[0] for entry in sorted(self.entries)))
 
     def describe(self) -> dict[str, Any]:
@@ -329,6 +330,7 @@ class SubsetSplit(PublishedSplit):
 
     @property
     def entry_counts(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Subset -> number of the split's entries."""
         return dict.fromkeys((*self.train, *self.test), 1)
 
     def describe(self) -> dict[str, Any]:
