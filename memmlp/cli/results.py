@@ -15,6 +15,7 @@ from memmlp.cli.options import (
     add_run_options,
     config_dir_option,
     untrained_option,
+    weigh_groups_option,
 )
 from memmlp.cli.table import find_shown_runs, flag_changed_rounds, load_shown_sweep, print_tables
 from memmlp.common.errors import InputError
@@ -83,8 +84,9 @@ def _save_over_fewer(path: Path, kept: KeptResults) -> None:
 @results.command("join")
 @click.argument("names", nargs=-1, required=True, metavar="NAME...")
 @click.option("--name", "stem", required=True, help="File name without suffix.")
+@weigh_groups_option
 @click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Its data/ has the results.")
-def join_command(names: tuple[str, ...], stem: str, folder: Path) -> None:
+def join_command(names: tuple[str, ...], stem: str, weigh_groups: bool, folder: Path) -> None:
     """Join kept results of one sweep: of other seeds, or of other splits.
 
     NAMEs are the names of their files. Test clips of splits with other persons (data.split.seed) are pooled,
@@ -93,7 +95,8 @@ def join_command(names: tuple[str, ...], stem: str, folder: Path) -> None:
     from memmlp.report.joined_results import join_results
 
     parts = [_load_named(folder, name) for name in names]
-    _save_over_fewer(folder / "data" / f"{stem}.json", join_results(parts))
+    joined = replace(join_results(parts), weigh_groups=weigh_groups)
+    _save_over_fewer(folder / "data" / f"{stem}.json", joined)
 
 
 def _load_named(folder: Path, name: str) -> KeptResults:
@@ -128,7 +131,9 @@ def make_kept_table(
     # With the command line's overrides, the table warns about changed data.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)
     if kept.splits:  # variants without runs in all splits are left out
-        sweep = replace(sweep, variants=tuple(one for one in sweep.variants if one.label in kept.variants))
+        variants = tuple(one for one in sweep.variants if one.label in kept.variants)
+        control = sweep.control if sweep.control in kept.variants else variants[0].label
+        sweep = replace(sweep, variants=variants, control=control)
     flags: list[str] = []
     rounds = Rounds.from_json(kept.rounds) if kept.rounds else None
     other = flag_changed_rounds(rounds, sweep) if rounds else None
@@ -145,7 +150,7 @@ def make_kept_table(
         seeds = sorted({*sweep.seeds, *(seed for by_seed in kept.runs.values() for seed in by_seed)})
         sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
         sweep, runs, restricted = restrict_and_group_clips(
-            sweep, kept.select_runs(sweep), source, patterns, weigh_groups
+            sweep, kept.select_runs(sweep), source, patterns, weigh_groups or kept.weigh_groups
         )
         flags = [*restricted, *([other] if other else [])]
         table = make_table(sweep, runs, command=kept.command_for_all_splits)

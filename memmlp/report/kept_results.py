@@ -42,6 +42,7 @@ class KeptResults:
         flags: warnings about how the seeds were chosen.
         splits: if the test clips of several splits are pooled, each split's override; "" for that of
             `overrides`. The id of a pooled run is those of its trainings, with a plus between.
+        weigh_groups: whether the table gives each group of test clips the same weight.
     """
 
     sweep: str
@@ -51,6 +52,7 @@ class KeptResults:
     rounds: Mapping[str, Any] | None = None
     flags: tuple[str, ...] = ()
     splits: tuple[str, ...] = ()
+    weigh_groups: bool = False
 
     @property
     def command(self) -> str:
@@ -174,6 +176,7 @@ def format_results(kept: KeptResults) -> str:
         "rounds": kept.rounds,
         "flags": list(kept.flags),
         **({"splits": list(kept.splits)} if kept.splits else {}),
+        **({"weigh_groups": True} if kept.weigh_groups else {}),
         "clips": dict(
             sorted({digest(_list_clips(run))[:8]: _list_clips(run) for run in kept.all_runs}.items())
         ),
@@ -203,10 +206,16 @@ def load_kept_results(path: Path) -> KeptResults:
             label: {int(seed): runs[name] for seed, name in seeds.items()}
             for label, seeds in content["cells"].items()
         }
-        variants = {label: tuple(texts) for label, texts in content["variants"].items()}
-        overrides, flags = tuple(content["overrides"]), tuple(content["flags"])
-        splits = tuple(content.get("splits", ()))
-        return KeptResults(content["sweep"], overrides, cells, variants, content["rounds"], flags, splits)
+        return KeptResults(
+            content["sweep"],
+            tuple(content["overrides"]),
+            cells,
+            {label: tuple(texts) for label, texts in content["variants"].items()},
+            content["rounds"],
+            tuple(content["flags"]),
+            tuple(content.get("splits", ())),
+            content.get("weigh_groups", False),
+        )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: damaged ({error}); write it again with memmlp results save") from None
 

@@ -71,6 +71,10 @@ def test_kept_results_are_joined(memmlp: Memmlp, planned: None):
     memmlp("results", "save", "14")
     assert Path("docs/results/data/table14.json").read_bytes() == saved
     assert one_line(memmlp("results", "join", "one", "tow", "--name", "x"), "tow.json", "must be one of: one")
+    flag = "each group of test clips has the same weight"
+    for words in ((), ("--weigh-groups",)):
+        memmlp("results", "join", "one", "two", "--name", "weighed", *words)
+        assert (flag in " ".join(memmlp("results", "show", "weighed").out.split())) == bool(words)
 
 
 def test_pages_without_data_go(memmlp: Memmlp, planned: None):

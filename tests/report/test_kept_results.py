@@ -9,6 +9,7 @@ import pytest
 from fake_table import cell as find_cell
 
 from memmlp.common.errors import InputError
+from memmlp.cli.results import make_kept_table
 from memmlp.report.joined_results import join_results
 from memmlp.report.kept_results import (
     KeptResults,
@@ -162,4 +163,7 @@ def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, tm
     with pytest.raises(InputError, match="results that pool the same splits"):
         join_results([pooled, first])
     parts = [select_seeds(replace(pooled, runs={"2, 4": pooled.runs["2, 4"]}), seed) for seed in (0, 1)]
-    assert join_results(parts).runs == {"2, 4": pooled.runs["2, 4"]}
+    joined = join_results(parts)
+    assert joined.runs == {"2, 4": pooled.runs["2, 4"]}
+    table = make_kept_table(replace(joined, variants={"2, 4": joined.variants["2, 4"]}))
+    assert table.control == "2, 4"  # the first that is left, since the sweep's control is not
