@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from fake_table import cell as find_cell
 
-from memmlp.common.errors import InputError
 from memmlp.cli.results import make_kept_table
+from memmlp.common.errors import InputError
 from memmlp.report.joined_results import join_results
 from memmlp.report.kept_results import (
     KeptResults,
