@@ -24,6 +24,7 @@ SEARCHED = (
     "optim", "optim.lr", "optim.weight_decay", "optim.batch", "profile.scale", "data.mirror", "loss",
 )  # fmt: skip
 RECIPE = "recipe"  # the trial of a network's own optimiser settings; other trials have numbers
+DIVERGED = "inf"  # MPJPE of a trial whose loss became infinite
 Trial = Mapping[str, str]  # a line of TRIALS
 UNDECIDED = (Verdict.INCONCLUSIVE, Verdict.EQUIVALENT)
 
@@ -129,12 +130,12 @@ class Placeholders:
 
     def searches(self, trials: int, tflop: float) -> str:
         """Return a table of a search at equal compute, with the best of the first random trials and the trial
-        of the network's own recipe. Networks that lack one of these are left out. Raises InputError if a
-        trial's compute differs from `tflop` by more than 5 %."""
+        of the network's own recipe. Networks that lack one of these are left out. A diverged trial's MPJPE is
+        inf. Raises InputError if another trial's compute differs from `tflop` by more than 5 %."""
         wanted = [*map(str, range(trials)), RECIPE]
         by_network: dict[str, dict[str, Trial]] = {}
         for trial in self._trials:
-            if not 0.95 <= float(trial["tflop"]) / tflop <= 1.05:
+            if trial["MPJPE"] != DIVERGED and not 0.95 <= float(trial["tflop"]) / tflop <= 1.05:
                 raise InputError(f"{TRIALS}: {trial['network']} {trial['trial']}: must have {tflop} TFLOP")
             by_network.setdefault(trial["network"], {})[trial["trial"]] = trial
         lines = []
@@ -153,7 +154,7 @@ class Placeholders:
 
     def counted_compute(self) -> str:
         """Return the range of the trials' training compute."""
-        counted = [float(trial["tflop"]) for trial in self._trials]
+        counted = [float(trial["tflop"]) for trial in self._trials if trial["MPJPE"] != DIVERGED]
         return f"{min(counted):.3g} to {max(counted):.3g} TFLOP"
 
     def _count_claims(self, tables: Iterable[Table], mode: str, branch: str) -> str:

@@ -164,5 +164,8 @@ def test_a_search_has_networks_with_all_trials_and_their_compute():
     own = row | {"trial": "recipe", "MPJPE": "6"}
     page = make_pages({}, template, [row, own, row | {"network": "late"}])["t.md"]
     assert ("| a | 6.00 | 6.50 | recipe | x" in page, "late" in page) == (True, False)
+    diverged = row | {"MPJPE": "inf", "tflop": ""}
+    page = make_pages({}, {"t.md": "{{ searches(1, 5) }} {{ counted_compute() }}"}, [diverged, own])["t.md"]
+    assert ("| a | 6.00 | inf | recipe | x" in page, page.split()[-4:]) == (True, ["5", "to", "5", "TFLOP"])
     with pytest.raises(InputError, match="a 0: must have 5 TFLOP"):
         make_pages({}, template, [row | {"tflop": "4"}])
