@@ -65,13 +65,15 @@ def draw_pictures(sources: Mapping[str, KeptTable]) -> dict[str, bytes]:
 def join_budgets(sources: Mapping[str, KeptTable]) -> dict[str, Table]:
     """Return the tables of frontiers by page name.
 
-    Pages that differ only in the training compute have one, on the first page, with the variants of all.
+    Pages that differ only in the training compute have one, on the first page, with the variants of all. Clips
+    of equal weight and groups of equal weight are never in one picture.
     """
     first: dict[tuple[str, ...], str] = {}
     joined: dict[str, Table] = {}
     for name, source in sorted(sources.items()):
         others = [text for text in source.kept.overrides if not text.startswith("optim.tflop=")]
-        page = first.setdefault((source.kept.sweep, *others, *source.kept.splits), name)
+        key = source.kept.sweep, *others, *source.kept.splits, *["weighed"] * source.kept.weigh_groups
+        page = first.setdefault(key, name)
         rows = joined[page].rows if page in joined else ()
         joined[page] = replace(source.table, rows=(*rows, *source.table.rows))
     return {name: table for name, table in joined.items() if list_costs(table)}

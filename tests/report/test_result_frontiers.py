@@ -89,4 +89,6 @@ def test_the_page_has_a_picture_and_its_file_the_costs(table: Table):
     (picture,) = draw_pictures(sources).values()
     assert "_frontier.svg" not in made["few.md"]
     assert picture == draw_frontiers(table)
+    weighed = KeptTable(replace(both[1], weigh_groups=True), halves[1], lambda *_: table)
+    assert draw_pictures(sources | {"few": weighed}).get("budgets_frontier.svg") != picture
     assert len(set(re.findall(rb"<!-- (Mem-MLP|RPM|VAE-HMD) -->", picture))) == 3

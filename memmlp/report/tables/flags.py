@@ -423,7 +423,8 @@ def _flag_missing_replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> It
         if few := [one for one, two in pairs if len(runs[one].keys() & runs[two].keys()) == 1]:
             interval = "no interval" if one_group else "an interval about other clips alone"
             yield f"one seed, so {interval}, and nothing is significant: {join_quoted(few)}"
-    sizes = [(Counter(map(run.get_group, run.clips)), len(run.clips)) for run in every if run.clips]
+    own = [run for run in every if run.clips and not run.clips_are_groups]
+    sizes = [(Counter(map(run.get_group, run.clips)), len(run.clips)) for run in own]
     counts = [(list(groups.values()).count(1), clips) for groups, clips in sizes]
     if counts and not one_group and all(alone >= UNGROUPED_FRACTION * clips for alone, clips in counts):
         alone, clips = min(counts)

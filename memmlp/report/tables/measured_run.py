@@ -126,6 +126,7 @@ class MeasuredRun:
             asks for.
         code: code digests by file (`compute_code_digests`), joined with different digests of prerequisite
             runs; empty for kept results.
+        clips_are_groups: whether each clip is the mean of a group (`average_groups`).
     """
 
     id: str
@@ -138,6 +139,7 @@ class MeasuredRun:
     clip_sources: Mapping[str, str] = field(default_factory=dict)
     training: Mapping[str, float] = field(default_factory=dict)
     code: Mapping[str, str] = field(default_factory=dict)
+    clips_are_groups: bool = False
 
     def get_value(self, mode: str, branch: str, metric: str) -> float | None:
         """Return a metric's mean over clips, or a cost; None if it was not measured."""
@@ -180,7 +182,7 @@ class MeasuredRun:
         for clip in self.clips:
             members.setdefault(self.get_group(clip), []).append(clip)
         means = {group: self.restrict_to_clips(clips).means for group, clips in sorted(members.items())}
-        averaged = replace(self, clips=means, groups={}, clip_sources={})
+        averaged = replace(self, clips=means, groups={}, clip_sources={}, clips_are_groups=True)
         return averaged.restrict_to_clips(list(means))
 
     def split_by_source(self) -> dict[str, MeasuredRun]:

@@ -71,7 +71,9 @@ def test_groups_of_equal_weight_are_like_clips(tmp_path: Path):
             found = averaged[label][seed]
             assert list(found.get_clip_values(names, "stream", "rotation", "MPJPE")) == pytest.approx(means)
             assert found.get_value("stream", "rotation", "MPJPE") == pytest.approx(np.mean(means))
-    effects = [make_table(sweep, one).rows[1].cells["stream"]["MPJPE"].effect for one in (runs, averaged)]
+    tables = [make_table(sweep, one) for one in (runs, averaged)]
+    assert not any("of its own" in flag for table in tables for flag in table.flags)
+    effects = [table.rows[1].cells["stream"]["MPJPE"].effect for table in tables]
     assert [(one.clips, one.groups) for one in effects] == [
         (len(CLIPS), len(names)),
         (len(names), len(names)),
