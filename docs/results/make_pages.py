@@ -65,8 +65,8 @@ def draw_pictures(sources: Mapping[str, KeptTable]) -> dict[str, bytes]:
 def join_budgets(sources: Mapping[str, KeptTable]) -> dict[str, Table]:
     """Return the tables of frontiers by page name.
 
-    Pages that differ only in the training compute have one, on the first page, with the variants of all. Clips
-    of equal weight and groups of equal weight are never in one picture.
+    Pages that differ only in the training compute have one, on the first page, with the variants of all.
+    Tables with clips of equal weight and with groups of equal weight are never in one picture.
     """
     first: dict[tuple[str, ...], str] = {}
     joined: dict[str, Table] = {}
