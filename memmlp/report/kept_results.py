@@ -110,12 +110,13 @@ class KeptResults:
             InputError: if the older results have other overrides, another sweep or additional runs.
         """
         if (self.sweep, self.overrides, self.splits) != (other.sweep, other.overrides, other.splits):
-            raise InputError(f"contains results of '{other.command}', not of '{self.command}'")
+            own = self.command_for_all_splits
+            raise InputError(f"contains results of '{other.command_for_all_splits}', not of '{own}'")
         lost = [
-            f"'{label}' seed {seed}"
+            f"'{label}' seed {seed} (run {run.id})"
             for label, runs in other.runs.items()
-            for seed in runs
-            if seed not in self.runs.get(label, {})
+            for seed, run in runs.items()
+            if (new := self.runs.get(label, {}).get(seed)) is None or (run.means and new.id != run.id)
         ]
         if lost:
             raise InputError(f"contains results of runs that were not found: {', '.join(lost[:12])}")

@@ -76,8 +76,17 @@ def test_kept_results_have_the_same_bytes(kept: KeptResults, tmp_path: Path):
 def test_results_with_further_runs_are_not_replaced(kept: KeptResults):
     fewer = replace(kept, runs={label: {0: runs[0]} for label, runs in kept.runs.items()})
     kept.check_can_replace(fewer)
-    with pytest.raises(InputError, match=r"not found: '2' seed 1, '2' seed 2, '2, 4' seed 1"):
+    with pytest.raises(InputError, match=r"not found: '2' seed 1 \(run \w+\), '2' seed 2 \(run"):
         fewer.check_can_replace(kept)
+    other = replace(kept.runs["2"][1], id="other")  # of other data, or trained before an edit
+    changed = replace(kept, runs={**kept.runs, "2": {**kept.runs["2"], 1: other}})
+    with pytest.raises(InputError, match=r"not found: '2' seed 1 \(run other\)$"):
+        kept.check_can_replace(changed)
+    costs = replace(other, means={}, clips={})
+    kept.check_can_replace(replace(kept, runs={**kept.runs, "2": {**kept.runs["2"], 1: costs}}))
+    split = replace(kept, splits=("", "data.split.seed=7"))
+    with pytest.raises(InputError, match=r"again with data\.split\.seed=7"):
+        kept.check_can_replace(split)
     with pytest.raises(InputError, match="data=synthetic"):
         kept.check_can_replace(replace(kept, overrides=("data=synthetic",)))
 
