@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import outputs_option, overrides_argument
 from memmlp.cli.sweep import run_workers
 from memmlp.cli.table import SHOWN_MODES, ShownSweep, make_plan_table, print_tables
 from memmlp.cli.workers import Workers, split_executor
@@ -27,7 +27,7 @@ ABLATION = "demo"
 
 
 @click.command("demo")
-@click.argument("overrides", nargs=-1)
+@overrides_argument
 @outputs_option
 def demo(overrides: tuple[str, ...], outputs: Path) -> None:
     """See a trained network on a real clip, then train and compare two small ones, in three minutes.

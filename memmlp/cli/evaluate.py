@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import PATH, add_run_options, device_option
+from memmlp.cli.options import PATH, add_run_options, device_option, overrides_argument
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.common.text_formats import make_console, make_override
@@ -13,7 +13,7 @@ from memmlp.runs.lookup import copy_shipped, find_run, find_shipped
 
 @click.command("eval")
 @click.argument("run")
-@click.argument("overrides", nargs=-1)
+@overrides_argument
 @click.option(
     "--save-predictions",
     type=PATH,
@@ -78,7 +78,7 @@ def evaluate(
 @click.command("import-weights")
 @click.argument("model")
 @click.argument("checkpoint", type=PATH)
-@click.argument("overrides", nargs=-1)
+@overrides_argument
 @click.option("--mean", type=PATH, help="File with the mean of the rotations, if the network needs it.")
 @click.option("--std", type=PATH, help="File with the standard deviation of the rotations; needs --mean.")
 @click.option("--refiner", type=PATH, help="File with the weights of SAGE-Net's refiner.")

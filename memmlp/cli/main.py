@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
+from pathlib import Path
 from typing import NamedTuple
 
 import click
@@ -145,6 +146,9 @@ def _format_error(error: Exception, arguments: Sequence[str]) -> str:
         return f"{error.format_message()} (see {path} --help)"
     if isinstance(error, OSError):
         reason = "no such file or folder" if error.errno == errno.ENOENT else error.strerror
+        if error.errno == errno.ENOTDIR:
+            above = Path(os.fsdecode(error.filename)).parents
+            return f"{next(path for path in above if path.exists())}: must be a folder, not a file"
         return f"{error.filename or 'a file'}: {reason}"
     return error.format_message() if isinstance(error, click.ClickException) else str(error)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from memmlp.common.overrides import notify_repeats
 from memmlp.common.settings import DEVICE
 from memmlp.config.plugins import activate, search_folder, split_names
 from memmlp.runs.lookup import count_training_frames, find_run, warn_if_hardly_trained
@@ -85,6 +86,13 @@ class SenderNetwork(click.ParamType):
         except ValueError as error:
             self.fail(f"{value}: {error}; expected an IPv4 address, or a network such as 192.168.1.0/24")
 
+
+def _notify_repeats(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> tuple[str, ...]:
+    notify_repeats(value)
+    return value
+
+
+overrides_argument = click.argument("overrides", nargs=-1, callback=_notify_repeats)
 
 outputs_option = click.option(
     "--outputs",

@@ -14,12 +14,14 @@ from memmlp.cli.options import (
     add_clip_options,
     add_run_options,
     config_dir_option,
+    overrides_argument,
     untrained_option,
     weigh_groups_option,
 )
 from memmlp.cli.table import find_shown_runs, flag_changed_rounds, load_shown_sweep, print_tables
 from memmlp.common.errors import InputError
 from memmlp.common.files import make_json_safe
+from memmlp.common.text_formats import join_command
 from memmlp.config.compose_plan import find_sweep, is_path
 from memmlp.runs.identity import list_outdated
 
@@ -37,7 +39,7 @@ def results() -> None:
 
 @results.command("save")
 @click.argument("name", metavar="SWEEP")
-@click.argument("overrides", nargs=-1)
+@overrides_argument
 @click.option("--out", type=HomePath(file_okay=False), default=FOLDER / "data", help="Folder to write to.")
 @untrained_option
 @click.option("--name", "stem", help="File name without suffix.  [default: the sweep's name]")
@@ -52,6 +54,7 @@ def save_command(
     additional runs.
     """
     from memmlp.report.kept_results import KeptResults, list_overrides, shorten_paths
+    from memmlp.report.tables.flags import flag_missing_runs
 
     sweep = find_sweep(name, overrides)
     shown = load_shown_sweep(sweep, overrides, outputs.absolute())
@@ -64,9 +67,12 @@ def save_command(
         make_json_safe(asdict(shown.rounds)) if shown.rounds else None,
         flags,
     )
+    command = join_command(["memmlp", "sweep", name, *overrides])
     if not kept.all_runs:
-        raise InputError(f"sweep {name}: has no finished runs; run the sweep with: {kept.command}")
+        raise InputError(f"sweep {name}: has no finished runs; run the sweep with: {command}")
     _save_over_fewer(out / f"{stem or sweep.name}.json", kept)
+    for line in flag_missing_runs(shown.sweep, runs, command, lambda variant, seed: ""):
+        click.echo(line)
 
 
 def _save_over_fewer(path: Path, kept: KeptResults) -> None:
@@ -86,7 +92,7 @@ def _save_over_fewer(path: Path, kept: KeptResults) -> None:
 @click.option("--name", "stem", required=True, help="File name without suffix.")
 @weigh_groups_option
 @click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Its data/ has the results.")
-def join_command(names: tuple[str, ...], stem: str, weigh_groups: bool, folder: Path) -> None:
+def join(names: tuple[str, ...], stem: str, weigh_groups: bool, folder: Path) -> None:
     """Join kept results of one sweep: of other seeds, or of other splits.
 
     NAMEs are the names of their files. Test clips of splits with other persons (data.split.seed) are pooled,
@@ -115,7 +121,11 @@ def _load_named(folder: Path, name: str) -> KeptResults:
 @click.option("--folder", type=HomePath(file_okay=False), default=FOLDER, help="Its data/ has the results.")
 def show(name: str, source: str | None, together: tuple[str, ...], weigh_groups: bool, folder: Path) -> None:
     """Print the table of kept results. NAME is the name of their file; no run is needed."""
-    print_tables([make_kept_table(_load_named(folder, name), source, together, weigh_groups)])
+    kept = _load_named(folder, name)
+    table = make_kept_table(kept, source, together, weigh_groups)
+    splits = ", ".join(split or "the default split" for split in kept.splits)
+    pooled = (f"test clips of several splits are pooled: {splits}",) if splits else ()
+    print_tables([replace(table, flags=(*pooled, *table.flags))])
 
 
 def make_kept_table(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import add_run_options, config_dir_option
+from memmlp.cli.options import add_run_options, config_dir_option, overrides_argument
 from memmlp.cli.table import (
     SHOWN_MODES,
     ShownSweep,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @click.command("sweep")
 @click.argument("name")
-@click.argument("overrides", nargs=-1)
+@overrides_argument
 @click.option(
     "--variant",
     "variants",

@@ -15,6 +15,7 @@ from memmlp.cli.options import (
     add_clip_options,
     add_run_options,
     config_dir_option,
+    overrides_argument,
     untrained_option,
 )
 from memmlp.common.errors import InputError
@@ -36,7 +37,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 
 @click.command("table")
 @click.argument("name")
-@click.argument("overrides", nargs=-1)
+@overrides_argument
 @click.option(
     "--format",
     "form",

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, RunStopped, TrainingDiverged, is_interruption
 from memmlp.common.files import find_packaged_folder
-from memmlp.common.overrides import parse_overrides
+from memmlp.common.overrides import notify_repeats, parse_overrides
 from memmlp.config.check import explain_error
 from memmlp.config.compose import (
     CONFIG,
@@ -56,6 +56,7 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
     if len(jobs) > 1 and distributed.world_size() > 1:
         raise InputError("torchrun: several processes train one run; start it without --multirun")
     _check_prediction_folders(jobs)
+    notify_repeats(args.overrides)
     failures: list[Exception] = []
     train_from_config = _collect_failures(job or run_training, failures)
     keys = [override.key for override in parse_overrides(args.overrides)]

@@ -114,6 +114,8 @@ def make_metrics_table(measured: MeasuredRun, title: str = "test clips") -> Tabl
     """Make a table with a column for each mode and branch. A mean over a part of the clips is marked."""
     means = measured.means
     shown = [(mode, branch) for mode, branch in MODES_AND_BRANCHES if branch in means.get(mode, {})]
+    if measured.has_one_branch:  # the errors of both branches are equal
+        shown = [(mode, branch) for mode, branch in shown if branch != "position"]
     columns = [Column("metric"), Column("unit")]
     columns += [Column(f"{mode}\n{branch}", justify="right") for mode, branch in shown]
     style: dict[str, Any] = {"box": SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import add_run_options, config_dir_option
+from memmlp.cli.options import add_run_options, config_dir_option, overrides_argument
 from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.components import find_chosen_settings
 from memmlp.common.errors import InputError
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @click.command("tune")
-@click.argument("overrides", nargs=-1)
+@overrides_argument
 @add_worker_options
 @click.option("--status", is_flag=True, help="Only show the search's progress.")
 @config_dir_option

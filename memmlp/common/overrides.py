@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from memmlp.common.progress import notify
+
 SIGNS = "+~"
 """The signs at the start of an override: + and ++ add a key, ~ removes a key."""
 
@@ -45,6 +47,15 @@ class Override:
 def parse_overrides(texts: Iterable[str]) -> list[Override]:
     """Parse several overrides."""
     return [Override.parse(text) for text in texts]
+
+
+def notify_repeats(texts: Iterable[str]) -> None:
+    """Tell the user which overrides of a command line replace earlier ones of the same key."""
+    last: dict[str, str] = {}
+    for one in parse_overrides(texts):
+        if one.signs != "~" and (before := last.get(one.key, one.text)) != one.text:
+            notify(f"{one.text} replaces {before}")
+        last[one.key] = one.text
 
 
 def select_last_by_key(texts: Iterable[str]) -> dict[str, Override]:

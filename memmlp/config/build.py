@@ -27,7 +27,7 @@ from memmlp.common.text_formats import escape_interpolations, make_override
 from memmlp.config import plugins
 from memmlp.config.build_request import build_request, read_source_weights
 from memmlp.config.check import check
-from memmlp.config.compose import compose_config, compose_unchecked
+from memmlp.config.compose import compose_config, compose_unchecked, convert_errors, merge_override
 from memmlp.config.schema import restore_config
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
@@ -280,16 +280,13 @@ def _use_outputs(cfg: DictConfig, outputs: Path) -> None:
 
 
 def _apply_override(cfg: DictConfig, word: str) -> None:
-    key, equals, _ = word.partition("=")
-    if not equals:
+    if "=" not in word or word.startswith(("+", "~")):
         raise InputError(f"{word}: must be KEY=VALUE")
-    try:
-        override = OverridesParser.create().parse_override(word)  # unlike YAML, Hydra reads off as text
+    with convert_errors([word]):
+        (override,) = OverridesParser.create().parse_overrides([word])
         if override.is_sweep_override():
             raise InputError(f"{word}: must be a single value, or a list in brackets: [A,B]")
-        OmegaConf.update(cfg, key, override.value(), merge=True)
-    except (OmegaConfBaseException, HydraException) as error:
-        raise InputError(f"{key}: {str(error).splitlines()[0]}") from None
+        merge_override(cfg, override)
 
 
 MAX_WORDS = 6

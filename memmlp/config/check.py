@@ -183,8 +183,10 @@ def _explain_type_error(error: OmegaConfBaseException, override: str | None) -> 
         return f"{SOURCES}: must be set in a custom config file (docs/guides/checks.md)"
     no_key = isinstance(error, ConfigAttributeError | ConfigKeyError)
     if no_key and not isinstance(error, InterpolationKeyError):
-        fields = dataclasses.fields(schema) if dataclasses.is_dataclass(schema) else ()
-        return describe_unknown_key(name, [field.name for field in fields])
+        if dataclasses.is_dataclass(schema):
+            return describe_unknown_key(name, [field.name for field in dataclasses.fields(schema)])
+        known = list(map(str, error.parent_node or ()))
+        return f"{describe_unknown_key(name, known)}; + in front of the key adds it"
     if isinstance(error, ValidationError):
         shown = override if override and override.lstrip("+").startswith(f"{name}=") else name
         return f"{shown}: expected {_describe_expected(name, schema, error)}"

@@ -17,6 +17,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, OverrideType
+from hydra.core.override_parser.types import Override as HydraOverride
 from hydra.core.plugins import Plugins
 from hydra.errors import ConfigCompositionException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -117,7 +118,7 @@ def compose_unchecked(overrides: Sequence[str]) -> DictConfig:
 def compose_plain(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """Compose another config than `train`, and return it as plain dictionaries. It is not checked."""
     args = parse_hydra_arguments(overrides)
-    with _initialize_hydra(args), _convert_errors(overrides):
+    with _initialize_hydra(args), convert_errors(overrides):
         return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
 
 
@@ -160,7 +161,7 @@ def _compose_jobs(args: argparse.Namespace) -> list[CheckedConfig]:
     jobs = []
     with _initialize_hydra(args):
         for overrides in _list_jobs(args):
-            with _convert_errors(overrides):
+            with convert_errors(overrides):
                 cfg = _compose_job(args, overrides)
             jobs.append(check(cfg))
             _reject_overrides_without_effect(jobs[-1].resolved, overrides)
@@ -196,12 +197,16 @@ def _compose_job(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
         return compose(args.config_name or CONFIG, overrides)
     cfg: DictConfig = pickle.loads(_compose_options(*(str(override.input_line) for override in options)))
     for override in values:
-        try:
-            OmegaConf.update(cfg, override.key_or_group, override.value(), merge=True)
-        except OmegaConfBaseException as error:
-            message = f"Error merging override {override.input_line}"
-            raise ConfigCompositionException(message) from error
+        merge_override(cfg, override)
     return cfg
+
+
+def merge_override(cfg: DictConfig, override: HydraOverride) -> None:
+    """Set the key of an override in a config, with Hydra's error for a wrong key or value."""
+    try:
+        OmegaConf.update(cfg, override.key_or_group, override.value(), merge=True)
+    except OmegaConfBaseException as error:
+        raise ConfigCompositionException(f"Error merging override {override.input_line}") from error
 
 
 @functools.lru_cache(maxsize=128)
@@ -275,7 +280,7 @@ def format_help(args: argparse.Namespace) -> str:
         for name in sorted(options.keys() - {".", "search"})
         if options[name]
     ]
-    with _initialize_hydra(args), _convert_errors(args.overrides):
+    with _initialize_hydra(args), convert_errors(args.overrides):
         config = OmegaConf.to_yaml(compose(args.config_name or CONFIG, args.overrides), resolve=args.resolve)
     return HELP.format(groups="\n".join(groups), config=config)
 
@@ -341,7 +346,7 @@ def _find_folder(name: str | Path, option: str) -> Path:
 def _list_jobs(args: argparse.Namespace) -> list[list[str]]:
     """Return the overrides of each job. Raises InputError for an override that cannot be parsed, or would
     replace another one: a second `experiment=`, or in a multirun a second override of a group's keys."""
-    with _convert_errors(args.overrides):
+    with convert_errors(args.overrides):
         parsed = OverridesParser.create().parse_overrides(args.overrides)
         chosen = list(dict.fromkeys(str(one.input_line) for one in parsed if one.key_or_group == EXPERIMENT))
         if len(chosen) > 1:
@@ -362,7 +367,8 @@ def _list_jobs(args: argparse.Namespace) -> list[list[str]]:
 
 
 @contextmanager
-def _convert_errors(overrides: Sequence[str]) -> Iterator[None]:
+def convert_errors(overrides: Sequence[str]) -> Iterator[None]:
+    """Raise InputError, in one line, for errors while these overrides are composed."""
     try:
         yield
     except InputError:

@@ -114,6 +114,10 @@ def _build_requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[t
         checked = compose_checked(list(sweep.merge_overrides(variant)))
         if checked.resolved["force"]:  # variants may share a run, which would be trained repeatedly
             raise InputError("force=true: expected --again, which trains a sweep's finished runs again")
+        chosen = {parse_key(text) for text in sweep.command_line}
+        solver = checked.resolved["evaluation"]["ik"]
+        if variant.branch == "combined" and solver == "off" and "evaluation.ik" not in chosen:
+            raise InputError("branch: combined needs evaluation.ik=lbfgs or evaluation.ik=arms")
         yield from zip(seeds, build_requests(checked, outputs, seeds), strict=True)
     except InputError as error:
         raise InputError(f"sweep {sweep.name}, variant '{variant.label}': {error}") from None

@@ -56,7 +56,10 @@ class OpenedRun:
         if get_shipped_name(run) and Path(root) == find_shipped_clip().parent:
             return ShippedMotion(find_shipped_clip(), load_rest_joints(str(motion.clips.body)))
         # Clips of the list may be missing, as long as the digest matches the training data.
-        data = replace(motion, partial=True).prepare()
+        try:
+            data = replace(motion, partial=True).prepare()
+        except InputError as error:
+            raise InputError(f"run {run.id}: needs the data of its training ({error})") from None
         if data.digest != run.manifest["data"]:
             raise InputError(f"run {run.id}: its data has changed since the training (data.root={root})")
         return data

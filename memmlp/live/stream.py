@@ -27,7 +27,7 @@ from memmlp.live.tracker_resampling import (
 )
 from memmlp.live.wearer import TILTED, Offsets, check_offsets, make_wearer
 from memmlp.motion.body import FEATURES
-from memmlp.runs.lookup import find_shipped
+from memmlp.runs.lookup import find_shipped, list_shipped
 from memmlp.runs.run import Run
 
 if TYPE_CHECKING:
@@ -164,6 +164,9 @@ class Stream:
         run = source if isinstance(source, Run) else Run(Path(source))
         if not run.folder.exists():
             run = find_shipped(str(source)) or run
+        if not run.folder.exists():
+            names = ", ".join(list_shipped())
+            raise InputError(f"source={source}: must be a run's folder, an ONNX file, or one of {names}")
         self.network = ExportedNetwork(run.preferred_onnx if run.folder.is_dir() else run.folder)
         if ik is not None and not self.network.has_position_branch:
             raise InputError(f"ik: must be None; {self.network.path} does not have a position branch")

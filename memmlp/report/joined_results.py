@@ -40,6 +40,8 @@ def join_results(parts: Sequence[KeptResults]) -> KeptResults:
         for label, overrides in one.variants.items():
             if variants.setdefault(label, overrides) != overrides:
                 raise InputError(f"variant '{label}': its overrides differ between the results")
+    if len(parts) < 2 or any(one == parts[0] for one in parts[1:]):
+        raise InputError("results join: needs at least two different results")
     if any(one.rounds for one in parts):
         raise InputError("results of --until-decided cannot be joined")
     by_split: dict[tuple[str, ...], list[KeptResults]] = defaultdict(list)
@@ -60,6 +62,8 @@ def _join_seeds(parts: Sequence[KeptResults]) -> KeptResults:
     for label, seed, run in ((*key, run) for one in parts for key, run in _list_runs(one)):
         if runs[label].setdefault(seed, run).id != run.id:
             raise InputError(f"'{label}' seed {seed}: has two runs, {runs[label][seed].id} and {run.id}")
+        if run.origin.data != (first := next(iter(runs[label].values()))).origin.data:
+            raise InputError(f"'{label}': run {run.id} has other data than run {first.id}")
     variants = {label: texts for one in parts for label, texts in one.variants.items()}
     flags = tuple(dict.fromkeys(flag for one in parts for flag in one.flags))
     return replace(parts[0], runs=runs, variants=variants, flags=flags)

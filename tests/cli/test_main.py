@@ -116,6 +116,8 @@ def test_a_second_start_a_typo_and_a_second_export_import_no_torch(home: Path):
     (["runs", "show"], ["RUN", "memmlp runs show --help"]),
     (["runs", "list", "--nope"], ["--nope", "memmlp runs list --help"]),
     (["runs", "show", "zz"], ["run 'zz'", "a run's folder"]),
+    (["train", "profile=tiny", f"paths.outputs={__file__}/a/b"], [f" {__file__}: must be a folder"]),
+    (["tune", "search.n_trialz=2"], ["search.n_trialz: no such key", "n_trials?", "objectives"]),
 ])  # fmt: skip
 def test_bad_usage_is_one_line(memmlp: Memmlp, arguments: list[str], words: list[str]):
     assert one_line(memmlp(*arguments), *words)

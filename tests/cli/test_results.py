@@ -17,7 +17,10 @@ def make_pages(check: bool = False) -> int:
 
 
 def test_kept_results_become_pages(memmlp: Memmlp, planned: None, capsys: pytest.CaptureFixture):
-    assert "table14.json: 4 runs" in memmlp("results", "save", "14", "seed=0").out
+    saved = "docs/results/data/table14.json: 4 runs\n"
+    fill = "missing: every variant's seed 99; fill with: memmlp sweep 14 seed=0,99\n"
+    assert memmlp("results", "save", "14", "seed=0").out == saved
+    assert memmlp("results", "save", "14", "seed=0,99").out == saved + fill
     assert "table14.json: 12 runs" in memmlp("results", "save", "14").out
     assert one_line(memmlp("results", "save", "14", "seed=0"), "table14.json", "seed 1", "--name")
     templates = Path("docs/results/templates")
@@ -98,9 +101,10 @@ def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["save", "99"], ("no such sweep",)),
-    (["save", "10"], ("no finished run", "memmlp sweep table10")),
+    (["save", "10", "seed=7"], ("no finished run", "memmlp sweep 10 seed=7")),
     (["save", "14", "optim.lr=1"], ("table14.json", "memmlp sweep table14 optim.lr=1", "--name")),
     (["save", "14", "--out", "/proc/no"], ("/proc/no",)),
+    (["join", "table14", "table14", "--name", "twice"], ("at least two different",)),
     (["show", "15"], ("data/15.json", "must be one of: table14")),
 ])  # fmt: skip
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):

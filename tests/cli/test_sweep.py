@@ -197,11 +197,14 @@ BAD_INPUT: list[tuple[list[str], str]] = [
     (["trial.yaml", "executor=slurm", "--gpus-per-worker", "1"], "--gpus-per-worker: "),
     (["trial.yaml", "device=cuda:x"], "device=cuda:x: "), (["trial.yaml", "seed=a"], "seed: ['a']"),
     (["trial.yaml", "data=mocap"], "variant 'full': data.root: has no value"),
+    (["solved.yaml"], "variant 'b': branch: combined needs evaluation.ik=lbfgs"),
 ]  # fmt: skip
 
 
 def test_bad_input_is_one_line(tmp_path: Path):
     write(tmp_path, VARIANTS)
+    solved = "branch: combined\nvariants: {a: [evaluation.ik=arms], b: []}\n"
+    (tmp_path / "solved.yaml").write_text(solved)
     for words, line in BAD_INPUT:
         said = run(tmp_path, "sweep", *words, code=2)
         assert line in said, words

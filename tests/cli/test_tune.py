@@ -83,6 +83,8 @@ def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
     for words in ([], ["--status"]):
         assert "2 of 2 trials: 2 complete" in command(home, "tune", *TINY, *TRIALS, *words)
     assert "not started" in command(home, "tune", *TINY, "search.seed=5", "--status")
+    fewer = [word for word in TRIALS if not word.startswith("search.n_trials")]
+    assert "2 of 2 trials" in command(home, "tune", *TINY, *fewer, "search.n_trials=1", "--status")
     assert (folder_of(home) / "study.journal").read_bytes() == before
 
 

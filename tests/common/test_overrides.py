@@ -2,7 +2,8 @@
 
 import pytest
 
-from memmlp.common.overrides import Override, flatten, select_last_by_key
+from memmlp.common.overrides import Override, flatten, notify_repeats, select_last_by_key
+from memmlp.common.progress import print_announcements
 
 
 @pytest.mark.parametrize(("text", "parts"), [
@@ -29,3 +30,9 @@ def test_the_last_override_of_a_key_wins_at_the_first_ones_place():
 
 def test_only_mappings_are_flattened():
     assert flatten({"a": {"b": [{"c": 1}], "d": {}}, "e": None}) == {"a.b": [{"c": 1}], "a.d": {}, "e": None}
+
+
+def test_an_override_that_replaces_another_one_is_announced(capsys: pytest.CaptureFixture[str]):
+    with print_announcements():
+        notify_repeats(["a=1", "b=1", "a=1", "a.b=2", "~c", "+a=2", "a=3"])
+    assert capsys.readouterr().err.splitlines() == ["+a=2 replaces a=1", "a=3 replaces +a=2"]

@@ -1,5 +1,6 @@
 """Finished runs opened again: which keys may then have other values."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,16 @@ def test_keys_of_later_stages_may_have_other_values(trained: Run):
 ])  # fmt: skip
 def test_a_key_without_effect_or_with_several_values_is_refused(trained: Run, word: str):
     with pytest.raises(InputError, match=f"^.*{word}"):
+        build_run_experiment(trained, "cpu", [word])
+
+
+@pytest.mark.parametrize(("word", "line"), [
+    ("evaluation.modez=1", "evaluation.modez: no such key; did you mean modes? expected one of modes, batch"),
+    ("evaluation.modes=a", "evaluation.modes=a: expected a list"), ("evaluation.ik=[", "expected KEY=VALUE"),
+    ("~evaluation.modes=[stream]", "must be KEY=VALUE"),
+])  # fmt: skip
+def test_a_wrong_override_of_a_finished_run_is_explained(trained: Run, word: str, line: str):
+    with pytest.raises(InputError, match=re.escape(line)):
         build_run_experiment(trained, "cpu", [word])
 
 

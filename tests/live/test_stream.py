@@ -290,6 +290,8 @@ def test_bad_arguments_are_rejected(file, step_files):
 def test_bad_files_are_refused(file, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         Stream(tmp_path)
+    with pytest.raises(InputError, match=r"source=recurent_poser: .* recurrent_poser$"):
+        Stream("recurent_poser")
     (tmp_path / "text.onnx").write_text("no network")
     with pytest.raises(InputError, match=r"text\.onnx"):
         Stream(tmp_path / "text.onnx")

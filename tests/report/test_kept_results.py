@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import Memmlp
 from fake_table import cell as find_cell
 
 from memmlp.cli.results import make_kept_table
@@ -131,9 +132,13 @@ def test_results_of_several_seeds_are_joined(kept: KeptResults):
         join_results([kept, twice])
     with pytest.raises(InputError, match=f"must be '{kept.command}'"):
         join_results([kept, replace(kept, overrides=("data=synthetic",))])
+    run = kept.runs["2"][1]
+    other = replace(run, origin=replace(run.origin, data="other"))
+    with pytest.raises(InputError, match=f"'2': run {run.id} has other data than run"):
+        join_results([select_seeds(kept, 0), replace(kept, runs={"2": {1: other}})])
 
 
-def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, tmp_path: Path):
+def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, memmlp: Memmlp, tmp_path: Path):
     """Means are over all clips; a clip of two splits counts once, with its mean error."""
     save_results(tmp_path / "kept.json", select_seeds(kept, 0, 1))
     first = load_kept_results(tmp_path / "kept.json")
@@ -151,8 +156,10 @@ def test_splits_are_pooled_to_one_table_of_all_their_clips(kept: KeptResults, tm
             runs[seed] = replace(run, id=f"{run.id}b", clips=clips, means=means)
     del moved["2"][0]
     second = replace(first, overrides=(*first.overrides, "data.split.seed=7"), runs=moved)
-    save_results(tmp_path / "kept.json", join_results([first, second]))
-    pooled = load_kept_results(tmp_path / "kept.json")
+    save_results(tmp_path / "data/pooled.json", join_results([first, second]))
+    shown = " ".join(memmlp("results", "show", "pooled", "--folder", str(tmp_path)).out.split())
+    assert "splits are pooled: the default split, data.split.seed=7" in shown
+    pooled = load_kept_results(tmp_path / "data/pooled.json")
     assert (pooled.splits, pooled.run_count) == (("", "data.split.seed=7"), 10)
     assert pooled.command_for_all_splits == f"{first.command}, and again with data.split.seed=7"
     seeds = {label: [*runs] for label, runs in pooled.runs.items()}

@@ -112,6 +112,9 @@ def test_eval_shows_the_card_and_measures_only_with_data(memmlp, tmp_path: Path)
     again = memmlp("eval", "recurrent_poser", "--again", "--outputs", str(tmp_path))
     assert again.code == 2
     assert "data.root" in again.err
+    assert "position" not in shown.out  # its errors would be those of the rotation branch again
+    other = memmlp("eval", "recurrent_poser", f"data.root={tmp_path}", "--outputs", str(tmp_path))
+    assert "run recurrent_poser: needs the data of its training" in other.err
 
 
 def test_a_card_has_only_branches_of_its_network(memmlp):

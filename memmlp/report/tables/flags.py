@@ -59,7 +59,7 @@ def find_flags(
     ]
     has_errors = bool(set(sweep.metrics) - set(COSTS))
     yield from _flag_other_data(sweep)
-    yield from _flag_missing_runs(sweep, runs, command, describe_run)
+    yield from flag_missing_runs(sweep, runs, command, describe_run)
     if has_errors:
         yield from _flag_branches(sweep, requested, runs, command)
     if offline := [label for label, run in every if run.origin.offline]:
@@ -172,9 +172,10 @@ def _flag_other_data(sweep: Sweep) -> Iterator[str]:
         yield f"a table of {own}, shown with {chosen}: errors are not comparable with the paper"
 
 
-def _flag_missing_runs(
+def flag_missing_runs(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, describe_run: DescribeRun
 ) -> Iterator[str]:
+    """Flag the planned seeds of variants without a finished run. `describe_run` tells a run's state."""
     lacking: dict[str, list[str]] = defaultdict(list)
     for variant in sweep.list_runnable():
         if seeds := find_missing_seeds(sweep, variant, runs):

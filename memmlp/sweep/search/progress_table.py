@@ -117,4 +117,5 @@ def describe_counts(study: Study) -> str:
     """Return a line with the number of trials in each state and the search's number of trials."""
     counts = Counter(ENDS.get(trial.state, "running") for trial in study.trials)
     states = ", ".join(f"{count} {state}" for state, count in counts.items())
-    return f"{len(study.trials)} of {study.search.n_trials} trials: {states or 'none yet'}"
+    total = max(study.search.n_trials, len(study.trials))  # n_trials can be lowered
+    return f"{len(study.trials)} of {total} trials: {states or 'none yet'}"
