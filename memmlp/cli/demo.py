@@ -1,4 +1,4 @@
-"""`memmlp demo`: a shipped network on a real clip, then a small ablation, in three minutes."""
+"""`memmlp demo`: a shipped network on a real clip, then a small ablation, in about a minute."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ABLATION = "demo"
 @overrides_argument
 @outputs_option
 def demo(overrides: tuple[str, ...], outputs: Path) -> None:
-    """See a trained network on a real clip, then train and compare two small ones, in three minutes.
+    """See a trained network on a real clip, then train and compare two small ones, in about a minute.
 
     The ablation trains Mem-MLP with and without memory on synthetic motion, two seeds each. OVERRIDES are
     those of `memmlp train`, for the ablation. A repeated demo continues an interrupted one.
