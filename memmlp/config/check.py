@@ -125,6 +125,9 @@ def _find_data_problems(data: Mapping[str, Any]) -> Iterator[str]:
         yield "data.sources: expected a weight for every source, or no weights"
     if (sources or isinstance(root, list)) and split.get("groups_file") is not None:
         yield "data.split.groups_file: must be null with several folders; set data.sources.NAME.groups_file"
+    files = [one.get("groups_file") for one in (split, *sources.values())]
+    if data["drawn_by"] == "groups" and any(files):  # a run's id does not depend on the file's content
+        yield "data.drawn_by=groups: cannot be used with a groups_file; set data.split.groups"
     held_out = split.get("val", 0) + (split["test"] if isinstance(split.get("test"), float) else 0)
     if held_out >= 1:
         yield f"data.split.val={split['val']}: must be below 1 in sum with data.split.test"

@@ -94,7 +94,7 @@ class DataConfig:
     min_frames: int = setting(at_least(2))
     strict: bool = setting()
     interpolation: str = setting(one_of("splines", "lines"), "lines")
-    drawn_by: str = setting(one_of("frames", "clips"))
+    drawn_by: str = setting(one_of("frames", "clips", "groups"))
     mirror: bool = setting(default=False)
 
 

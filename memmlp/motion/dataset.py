@@ -85,8 +85,9 @@ class WindowSampler:
     """Draws `batch` random windows of `window` frames. A draw depends only on seed and step. A window is
     identified by its last frame; a clip shorter than the window has one window, which ends at the clip's last
     frame. `drawn_by` is "frames", where all windows of the part are equally likely (docs/readings.md, no.
-    23), or "clips", where all clips are. `shares` are the relative frequencies of each source's windows; None
-    ignores sources."""
+    23); "clips", where all clips are; or "groups", where the frequency of a group of clips, such as a
+    person, is the square root of its number of windows. `shares` are the relative frequencies of each
+    source's windows; None ignores sources."""
 
     def __init__(
         self,
@@ -101,7 +102,11 @@ class WindowSampler:
         lengths = dataset.lengths.cpu().numpy()
         self.first_end = np.minimum(window, lengths) - 1
         self.windows = np.maximum(lengths - window + 1, 1)
-        weights = self.windows if drawn_by == "frames" else np.ones_like(self.windows)
+        weights = np.ones_like(self.windows) if drawn_by == "clips" else self.windows
+        if drawn_by == "groups":
+            group = np.unique(dataset.groups, return_inverse=True)[1]
+            roots = np.sqrt(np.bincount(group, self.windows))
+            weights = _round_shares(weights / roots[group] / roots.sum())
         self.weights = _scale_weights(weights, dataset.sources, shares) if shares else weights
         self.bounds = np.cumsum(self.weights)
 
@@ -131,7 +136,11 @@ def _scale_weights(
     named, scaled = np.array(sources), weights.astype(float)
     for source, share in shares.items():
         scaled[named == source] *= share / weights[named == source].sum()
-    return np.rint(scaled / sum(shares.values()) * SHARE_STEPS).astype(np.int64)
+    return _round_shares(scaled / sum(shares.values()))
+
+
+def _round_shares(shares: np.ndarray) -> np.ndarray:
+    return np.rint(shares * SHARE_STEPS).astype(np.int64)
 
 
 def _map_array(path: Path) -> Tensor:

@@ -108,6 +108,9 @@ DATA_PATH = re.compile(r"data\.(root|body|split\.folder|sources\..+\.root)")
 DRAWS = re.compile(r"data\.(drawn_by|mirror|sources\..+\.weight)")
 """The config keys for drawing training windows; the data's digest does not cover them."""
 
+GROUPS = re.compile(r"data\.(split|sources\..+?)\.(groups|persons)(\..*)?")
+"""The config keys of clip groups. They count for training with data.drawn_by=groups."""
+
 VQVAE_SHAPE = ("codes", "width", "encoder_depth", "decoder_depth", "commitment", "decay", "codebook")
 """The VQ-VAE keys that count if it is trained with the network; other keys concern separate training."""
 
@@ -266,6 +269,8 @@ def select_training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     out = (*NEUTRAL, *STAGE_GROUPS, *(() if as_live else INFERENCE))
     flat = {key: value for key, value in flatten(config).items() if value is not None}
     counting = [key for key in flat if DRAWS.fullmatch(key) or not _is_below(key, out)]
+    if flat.get("data.drawn_by") == "groups":
+        counting += [key for key in flat if GROUPS.fullmatch(key)]
     if "optim.tflop" in counting:  # it sets the number of steps
         counting.remove("optim.steps")
     if "optim.best_by" in counting:

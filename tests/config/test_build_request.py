@@ -112,6 +112,24 @@ def test_weights_are_drawn_by_and_enter_the_identity_where_there_are_any():
     assert len({identity(cfg) for cfg in (weighted, bare, mix(None, "data.sources.cmu.weight=3"))}) == 3
 
 
+def test_groups_count_for_a_training_that_draws_them():
+    def identify(*words: str) -> str:
+        cfg = compose_config(["data=mocap", "data.root=a", *words])
+        return build_experiment(cfg).identity("0" * 64).id
+
+    groups, drawn = "data.split.groups=['(a)']", "data.drawn_by=groups"
+    assert identify() == identify(groups)
+    assert len({identify(), identify(drawn), identify(drawn, groups)}) == 3
+    persons = ["data=persons", "++data.split.persons.x=one"]
+    assert identify("data=persons") == identify(*persons)
+    assert identify("data=persons", drawn) != identify(*persons, drawn)
+    own = mix(with_source(groups=["x"]), drawn), mix(None, drawn)
+    assert len({build_experiment(cfg).identity("0" * 64).id for cfg in own}) == 2
+    Path("groups.csv").write_text("clip,group\nsalsa/01,ann\n")
+    with pytest.raises(InputError, match=r"data\.drawn_by=groups: .* groups_file"):
+        identify(drawn, "data.split.groups_file=groups.csv")
+
+
 def test_own_groups_and_column_files_enter_the_evaluation_alone():
     Path("groups.csv").write_text("clip,group\nsalsa/01,ann\n")
     every = [mix(), mix(with_source(groups=["x"])), mix(with_source(groups_file="groups.csv"))]

@@ -40,6 +40,12 @@ def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frame
     assert not torch.equal(sampler.draw(7)[1], WindowSampler(frames, 200, 6, seed=1).draw(7)[1])
     clips = WindowSampler(frames, batch=3000, window=6, seed=0, drawn_by="clips").draw(0)[0]
     assert torch.bincount(clips).min() > 800
+    long = tiny.frames((105, 55, 14))  # 100, 50 and 9 windows
+    long.groups = ["a", "a", "b"]
+    drawn = torch.bincount(WindowSampler(long, 9000, 6, seed=0, drawn_by="groups").draw(0)[0]) / 9000
+    roots = 150**0.5, 9**0.5
+    a, b = (root / sum(roots) for root in roots)
+    assert drawn.tolist() == pytest.approx([a * 2 / 3, a / 3, b], abs=0.02)
 
 
 CLIP = tiny.clip(20)

@@ -83,7 +83,7 @@ def test_streams_go_on_where_they_were():
     assert set(rollout.state_dict()) >= {"clip", "end", "lives", "state_motion", "state_sparse"}
 
 
-@pytest.mark.parametrize("drawn_by", ["frames", "clips"])
+@pytest.mark.parametrize("drawn_by", ["frames", "clips", "groups"])
 def test_streams_see_every_window_as_often_as_the_sampler_draws_it(drawn_by: str):
     """Long clips and short ones, one shorter than a stride, their beginnings like their ends."""
     lengths = (9, 40, 120, 331)
@@ -95,7 +95,8 @@ def test_streams_see_every_window_as_often_as_the_sampler_draws_it(drawn_by: str
         rollout.draw(model, frames, sampler, step)
         seen.index_put_((rollout.clip, rollout.end), torch.ones(400), accumulate=True)
     windows = [length - model.frames + 1 for length in lengths]
-    wanted = [number / sum(windows) if drawn_by == "frames" else 1 / 4 for number in windows]
+    weights = {"frames": windows, "clips": [1] * 4, "groups": [number**0.5 for number in windows]}[drawn_by]
+    wanted = [weight / sum(weights) for weight in weights]
     assert (seen.sum(1) / seen.sum()).tolist() == pytest.approx(wanted, abs=0.04)
     thirds = [float(part.mean()) for part in seen[3, model.frames - 1 :].tensor_split(3)]
     assert thirds == pytest.approx([sum(thirds) / 3] * 3, rel=0.12)
