@@ -1,10 +1,11 @@
 """Finds clips with common motion, and keeps these clips in one group and in one part of a split.
 
-There are four kinds of copies. The first has equal frames, even if the file was saved again. The second has
-a different frame rate (`find_resampled_copies`). The third shares a stretch of motion, such as overlapping
-cuts or a clip played backwards (`find_shared_stretches`). The fourth is another conversion of a take
-(`find_conversions`). Clips are also compared with mirror images, because some data sets contain mirrored
-motion. Clips without motion do not count as copies.
+There are four kinds of copies. The first has equal rotations, even if the file was saved again. The second
+has a different frame rate, but the same first frame (`find_resampled_copies`). The third shares a stretch of
+motion at any rate, such as overlapping cuts, every second frame or a clip played backwards
+(`find_shared_stretches`); it needs marked frames, which slow or short motion does not have. The fourth is
+another conversion of a take (`find_conversions`). Clips are also compared with mirror images, because some
+data sets contain mirrored motion. Clips without motion do not count as copies.
 
 If the split divides all clips in the folder, all copies of a clip get the same part. A published list may
 have copies in several parts. Then only the copies in one part stay: test has priority over validation, and
@@ -23,7 +24,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import FPS, SWAPPED, make_builtin_rest_joints
-from memmlp.motion.clip import LINES, Clip, resample
+from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import compute_clip_kinematics
 from memmlp.motion.preparing.find_clips import Root
@@ -31,13 +32,15 @@ from memmlp.motion.preparing.groups import find_root
 from memmlp.motion.preparing.manifest import PARTS, STILL, ClipRecord
 from memmlp.motion.preparing.splits import Split
 
-DEGREES, METRES = 1.0, 0.01  # maximum mean deviation of a copy at a different rate, over frames and joints
+FIRST = 0.01  # maximum deviation of rotation matrices in the first frames of copies at different rates
+DEGREES, METRES = 1.0, 0.01  # maximum mean deviation of these copies, over frames and joints
 
 REACH = 15  # number of frames at 60 Hz before and after a marked frame that are compared
 MOVING = 2.0  # degrees: minimum mean rotation of the joints in a stretch; standing people look alike
 ALIKE = 0.2  # degrees: maximum mean deviation; repetitions by one person differ by half a degree
 NEAR = 0.05  # maximum distance between the signatures of two marked frames that are compared
 SIGNATURE = 24  # numbers per signature
+SMOOTH = 2.0  # frames at 60 Hz: standard deviation of the filter for rotations and angular speeds
 
 
 def assign_parts(
@@ -110,14 +113,11 @@ def mirror_clip(clip: Clip) -> Clip:
 
 
 def compute_first_frames(clip: Clip) -> np.ndarray:
-    """Return the rotations and position in the first frame of a clip and of its mirror image (2, 201). Copies
-    at different frame rates have equal first frames."""
+    """Return the rotations in the first frame of a clip and of its mirror image (2, 198). Copies at different
+    frame rates have equal first frames, but imports may measure different floor heights."""
     start = replace(clip, poses=clip.poses[:1], trans=clip.trans[:1])
-    rows = []
-    for one in (start, mirror_clip(start)):
-        rotations = Rotation.from_rotvec(one.poses[0]).as_matrix()
-        rows.append(np.concatenate([rotations.ravel(), one.trans[0]]).astype(np.float32))
-    return np.stack(rows)
+    turns = [Rotation.from_rotvec(one.poses[0]).as_matrix().ravel() for one in (start, mirror_clip(start))]
+    return np.stack(turns).astype(np.float32)
 
 
 def find_resampled_copies(
@@ -137,7 +137,7 @@ def find_resampled_copies(
         near = near[(rates[near] != rates[index]) & (lengths[near] - lengths[index] <= FPS / slower + 1)]
         for mirrored in (False, True):
             off = np.abs(starts[near, 0] - starts[index, int(mirrored)]).max(-1, initial=0.0)
-            for other in near[off <= METRES]:  # also the bound for entries of rotation matrices
+            for other in near[off <= FIRST]:
                 one, two = (read_clip(root / moving[i].file, moving[i].name) for i in (index, other))
                 if _is_same_motion(mirror_clip(one) if mirrored else one, two):
                     yield moving[index], moving[other]
@@ -146,11 +146,12 @@ def find_resampled_copies(
 def _is_same_motion(one: Clip, other: Clip) -> bool:
     """Compare two clips at the lower of their frame rates."""
     slow, fast = sorted((one, other), key=lambda clip: clip.fps)
-    fast, _ = resample(fast, slow.fps, LINES)
+    fast, _ = resample(fast, slow.fps)
     frames = min(len(slow), len(fast))
     turns = [Rotation.from_rotvec(clip.poses[:frames].reshape(-1, 3)) for clip in (slow, fast)]
     angle = np.degrees((turns[0].inv() * turns[1]).magnitude().mean())
-    distance = np.linalg.norm(slow.trans[:frames] - fast.trans[:frames], axis=-1).mean()
+    apart = slow.trans[:frames] - fast.trans[:frames]
+    distance = np.linalg.norm(apart - apart.mean(0), axis=-1).mean()
     return bool(angle <= DEGREES and distance <= METRES)
 
 
@@ -159,9 +160,9 @@ def _is_same_motion(one: Clip, other: Clip) -> bool:
 
 class MarkedFrames(NamedTuple):
     """Marked frames of a clip at 60 Hz, or of its mirror image: indices (M,), and weighted sums of their
-    rotations (M, 24), which are similar for similar poses. Frames are marked at the local extrema, within a
-    quarter of a second on either side, of a fixed weighted sum of the rotations. They depend only on the
-    motion, so clips that share motion have corresponding marked frames."""
+    smoothed rotations (M, 24), which are similar for similar poses. Frames are marked at the local extrema,
+    within a quarter of a second on either side, of a fixed weighted sum. They depend only on the motion, so
+    clips that share motion have corresponding marked frames."""
 
     frames: np.ndarray
     signatures: np.ndarray
@@ -179,9 +180,16 @@ def compute_local_rotations(clip: Clip) -> np.ndarray:
     return rotations.reshape(len(clip), -1, 9).astype(np.float32)
 
 
+def _smooth(turns: np.ndarray) -> np.ndarray:
+    """Remove noise, because it differs between two samplings of a take, such as its odd and even frames."""
+    margin = round(4 * SMOOTH)  # the motion continues point-symmetrically beyond its ends
+    padded = np.pad(turns, ((margin, margin), (0, 0), (0, 0)), "reflect", reflect_type="odd")
+    return gaussian_filter1d(padded, SMOOTH, axis=0)[margin:-margin]
+
+
 def _mark_rotations(turns: np.ndarray) -> MarkedFrames:
     weights = np.random.default_rng(0).standard_normal((189, SIGNATURE)) / np.sqrt(SIGNATURE)
-    sums = turns.reshape(len(turns), -1) @ weights  # a random projection nearly preserves distances
+    sums = _smooth(turns).reshape(len(turns), -1) @ weights  # a random projection nearly preserves distances
     extrema = set()
     for signal in (sums[:, 0], -sums[:, 0]):
         extrema |= set(np.flatnonzero(signal == maximum_filter1d(signal, 2 * REACH + 1)))
@@ -217,7 +225,7 @@ def find_shared_stretches(
     @lru_cache(maxsize=16)
     def read_rotations(index: int, mirrored: bool) -> np.ndarray:
         clip = _read_resampled(root, clips[index])
-        return compute_local_rotations(mirror_clip(clip) if mirrored else clip)
+        return _smooth(compute_local_rotations(mirror_clip(clip) if mirrored else clip))
 
     every = [marks[clip.name][side] for side in (0, 1) for clip in clips]  # originals, then mirror images
     done: set[tuple[int, int]] = set()
@@ -232,7 +240,7 @@ def find_shared_stretches(
 
 
 def _read_resampled(root: Root, record: ClipRecord) -> Clip:
-    return resample(read_clip(root / record.file, record.name), interpolation=LINES)[0]
+    return resample(read_clip(root / record.file, record.name))[0]
 
 
 def _pair_marked_frames(
@@ -249,20 +257,21 @@ def _pair_marked_frames(
 
 def _has_same_rotations(one: np.ndarray, frame: int, other: np.ndarray, other_frame: int) -> bool:
     """Return whether two clips have equal rotations around one frame of each clip, forwards or backwards.
-    Extrema are flat, so frame indices are uncertain by one. If both clips were sampled from a higher rate,
-    the frames of one clip may lie between the frames of the other."""
+    Extrema are flat, so frame indices are uncertain by one. The frames of one clip may lie between the frames
+    of the other, so the fraction of a step that fits best is compared."""
     first = one[frame - REACH : frame + REACH + 1]
     near = other[max(other_frame - REACH - 1, 0) : other_frame + REACH + 2]
-    between = (near[1:] + near[:-1]) / 2
-    return any(
-        _measure_angles(first, frames[start : start + len(first)]).mean() <= ALIKE
-        for frames in (near, near[::-1], between, between[::-1])
-        for start in range(len(frames) - len(first) + 1)
-    )
+    for frames in (near, near[::-1]):
+        steps = np.diff(frames, axis=0, append=frames[-1:])
+        for start in range(len(frames) - len(first) + 1):
+            at, step = (numbers[start : start + len(first)] for numbers in (frames, steps))
+            part = np.clip(((first - at) * step).sum() / (step**2).sum(), 0, 1)
+            if _measure_angles(first, at + part * step).mean() <= ALIKE:
+                return True
+    return False
 
 
 BONES = [0, 1, 4, 16, 18, 2, 5, 17, 19]  # pelvis; left, then right hip, knee, shoulder and elbow
-SMOOTH = 2.0  # frames: standard deviation of the filter for angular speeds
 SLOW = 0.2  # rad/s, added to speeds before the logarithm
 APART = 15  # frames between marked frames, at least
 AROUND = np.arange(-30, 31, 3)  # frames around a marked frame that make its signature

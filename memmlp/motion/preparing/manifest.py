@@ -28,7 +28,7 @@ STILL = "still"  # `content` of all clips without motion
 class ClipRecord:
     """A clip in the cache. `name` and `file` are paths below the data root, `split` is its part, `group` that
     of `Grouping.name_groups`; `start` and `length` locate its frames in the part's array. `sha256` is the
-    digest of the source file, `content` that of the frames in single precision, equal for all copies and for
+    digest of the source file, `content` that of the rotations in single precision, equal for copies and for
     clips with common motion (`duplicates`); `STILL` for a clip without motion. `fps` is the source's rate,
     Hz, `resampling` the method (`clip.resample`)."""
 

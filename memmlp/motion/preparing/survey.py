@@ -10,7 +10,7 @@ from memmlp.common.errors import InputError, escape_line_breaks
 from memmlp.common.files import file_digest
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import LINES, Clip, SkippedFile, resample
+from memmlp.motion.clip import Clip, SkippedFile, resample
 from memmlp.motion.formats.npz import NoMotionError, read_clip
 from memmlp.motion.plausibility import check_plausible
 from memmlp.motion.preparing.duplicates import (
@@ -68,7 +68,7 @@ def survey_folder(root: Root, min_frames: int = 2, strict: bool = False) -> Surv
             _check_name(path, file, clips)
             clip = read_clip(path, name)
             faults = check_plausible(path, clip)
-            resampled, method = resample(clip, interpolation=LINES)  # the result does not depend on it
+            resampled, method = resample(clip)
             if len(resampled) < min_frames:
                 few = f"{len(resampled)} frames at {FPS} Hz"
                 raise TooShortError(f"{path}: {few}, fewer than data.min_frames={min_frames}")
@@ -104,9 +104,10 @@ def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
 
 
 def _compute_content_digest(clip: Clip) -> str:
-    """Return a digest of the frames in single precision. It ignores the saved type and the frame rate."""
-    parts = [clip.poses.reshape(len(clip), -1), clip.trans]
-    numbers = np.concatenate(parts, 1, dtype="<f4", casting="same_kind")
+    """Return a digest of the rotations in single precision, or of the translation if no joint turns. So it
+    ignores the saved type, the frame rate, and the floor height, which an import measures."""
+    poses, trans = (part.reshape(len(clip), -1).astype("<f4") for part in (clip.poses, clip.trans))
+    numbers = trans if (poses == poses[0]).all() else poses
     if (numbers == numbers[0]).all():
         return STILL
     return hashlib.sha256((numbers + np.float32(0)).tobytes()).hexdigest()  # + 0, for -0 is 0

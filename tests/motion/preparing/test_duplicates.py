@@ -92,6 +92,11 @@ def mirrored(clip: Clip) -> Clip:
     return replace(clip, poses=poses, trans=clip.trans * np.array([-1, 1, 1], np.float32))
 
 
+def lifted(clip: Clip) -> Clip:
+    """As an import that measures another floor height."""
+    return replace(clip, trans=clip.trans + np.float32([0, 0, 0.03]))
+
+
 def elsewhere(clip: Clip) -> Clip:
     """Turned about the vertical and moved away, with a drift."""
     turn = Rotation.from_euler("z", 70, degrees=True)
@@ -116,7 +121,7 @@ def write_all(root: Path, change: Callable[[Clip], Clip]) -> dict[str, str]:
     return {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
 
 
-@pytest.mark.parametrize(("fps", "change"), [(20.0, lambda clip: clip), (119.88, mirrored)])
+@pytest.mark.parametrize(("fps", "change"), [(20.0, lifted), (119.88, mirrored)])
 def test_a_copy_at_another_rate_is_found(
     root: Path, monkeypatch: pytest.MonkeyPatch, fps: float, change: Callable[[Clip], Clip]
 ):
@@ -135,11 +140,27 @@ def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypa
         monkeypatch.setattr(survey_module, name, lambda *_: [])
     clip, run = (cut(recorded(name), 0, 120) for name in ("walking", "running"))
     write_clip(root / "a" / "walking.npz", clip)
-    write_clip(root / "b" / "turns.npz", replace(clip, poses=np.concatenate([clip.poses[:1], run.poses[1:]])))
-    write_clip(root / "b" / "part.npz", cut(clip, 0, 60))
     slope = np.linspace(0, 0.1, len(clip))[:, None] * [1, 0, 0]
-    write_clip(root / "b" / "drifts.npz", replace(clip, trans=clip.trans + slope))
+    for name, other in {
+        "turns": replace(clip, poses=np.concatenate([clip.poses[:1], run.poses[1:]])),
+        "part": cut(clip, 0, 60),
+        "drifts": replace(clip, trans=clip.trans + slope),
+    }.items():
+        write_clip(root / "b" / f"{name}.npz", resample(other, 30.0)[0])
     assert survey_folder(root).duplicates == {}
+
+
+@pytest.mark.parametrize("rates", [(120, 60), (60, 180), (120, 180), (60, 30), (60, 25), (100, 60), (60, 60)])
+def test_a_noisy_take_is_found_at_another_rate_and_start(tmp_path: Path, rates: tuple[float, float]):
+    moving = ("walking", "running", "waving")
+    for activity in moving:
+        take = synthesize_clip(activity, 1, seconds=3.0, fps=180.0 if 180 in rates else 120.0)
+        noise = np.random.default_rng(0).normal(0, 0.003, take.poses.shape)
+        take = replace(take, poses=(take.poses + noise).astype(np.float32))
+        for folder, start, fps in zip("ab", (0, 1), rates, strict=True):
+            write_clip(tmp_path / folder / f"{activity}.npz", resample(cut(take, start), fps)[0])
+    expected = {f"b/{activity}": f"a/{activity}" for activity in moving}
+    assert survey_folder(tmp_path).duplicates == expected
 
 
 def between(clip: Clip) -> Clip:
