@@ -172,11 +172,14 @@ def _check_import(files: Mapping[Path, Path], out: Path, settings: ImportSetting
     if foreign or (out.exists() and not out.is_dir()):
         problem = f"has other clips, such as {foreign[0].as_posix()}" if foreign else "is a file"
         raise InputError(f"{out}: {problem}; must be a new folder, or the folder of the same import")
-    folders = sorted({make_folder_key(folder) for relative in files for folder in relative.parents})
+    folders = sorted({make_folder_key(folder) for relative in files for folder in relative.parents} - {""})
     for folder, rate in settings.fps.items():
-        if folder not in folders or not is_number(rate, *FRAME_RATE_RANGE):
-            choices = ", ".join(map(repr, folders))
-            raise InputError(f"--fps {folder}={rate!r}: must be 1 to 1000 Hz for one of {choices} ('': all)")
+        option = f"--fps {f'{folder}=' * bool(folder)}{rate:g}"
+        if not is_number(rate, *FRAME_RATE_RANGE):
+            raise InputError(f"{option}: the frame rate must be 1 to 1000 Hz")
+        if folder and folder not in folders:
+            choices = f", or FOLDER=HZ with {_format_names(folders, 8)}" if folders else ""
+            raise InputError(f"{option}: no recordings in a folder {folder}; must be HZ for all{choices}")
 
 
 def _describe_clip(relative: Path, result: _ConvertedFile) -> ImportedClip:

@@ -64,7 +64,7 @@ def test_import_warns_of_the_same_faults(source: Path) -> None:
 
 
 @pytest.mark.parametrize(("options", "key"), [
-    (("--fps", "fast"), "--fps fast"), (("--fps", "waltz=60"), "--fps waltz=60.0"),
+    (("--fps", "fast"), "--fps fast"), (("--fps", "waltz=60"), "a folder waltz"), (("--fps", "0"), "--fps 0"),
     (("--fps", "60", "--fps", "30"), "--fps 30"), (("--floor", "nan"), "--floor nan"),
     (("--skeleton", "none.yaml"), "--skeleton none.yaml"),
 ])  # fmt: skip

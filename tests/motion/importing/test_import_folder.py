@@ -61,8 +61,12 @@ def test_given_rates(source: Path, tmp_path: Path) -> None:
     assert list(rates(tmp_path / "out").values()) == [50, 30.5, 30.5, 50]
     assert [clip.fps for clip in report.clips] == [50, 30.5, 30.5, 50]
     assert {note.split(":")[0] for note in report.notes} == {".", "indian", "salsa"}
-    for fps in ({"waltz": 60}, {"salsa": 0}, {"salsa": float("nan")}):
-        with refuse("--fps", "'indian', 'salsa'"):
+    for fps, words in (
+        ({"waltz": 60}, ["--fps waltz=60", "indian, salsa"]),
+        ({"salsa": 0}, ["--fps salsa=0", "1 to 1000 Hz"]),
+        ({"": float("nan")}, ["--fps nan", "1 to 1000 Hz"]),
+    ):
+        with refuse(*words):
             import_folder(source, tmp_path / "wrong", ImportSettings(fps=fps, floor=NONE))
 
 
