@@ -108,12 +108,15 @@ def existing(kind: str, *words: str) -> Rule:
 
 
 def existing_clip_folders() -> Rule:
-    """Return the rule that a value must be the path of an existing folder, or a list of such paths."""
+    """Return the rule that a value must be the path of an existing folder, or a list of different paths.
+    `check` names a missing folder of a list."""
 
     def allows(value: Any) -> bool:
-        paths = [value] if isinstance(value, str) else list(value) if isinstance(value, Iterable) else []
-        exist = all(isinstance(path, str) and Path(path).is_dir() for path in paths)
-        return bool(paths) and exist and len(set(map(Path, paths))) == len(paths)
+        if isinstance(value, str):
+            return Path(value).is_dir()
+        paths = list(value) if isinstance(value, Iterable) else []
+        texts = all(isinstance(path, str) for path in paths)
+        return bool(paths) and texts and len(set(map(Path, paths))) == len(paths)
 
     words = "an existing folder of npz clips, such as from memmlp data import, or a list of such folders"
     return Rule(words, allows)

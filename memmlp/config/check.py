@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, NamedTuple, Union, cast, get_args, get_origin, get_type_hints
 
@@ -118,6 +119,10 @@ def _find_data_problems(data: Mapping[str, Any]) -> Iterator[str]:
     sources, root, split = data.get("sources") or {}, data["root"], data["split"]
     if (root is None) == (not sources):
         yield f"data.root={root}: must be a folder or a list of folders, or null with data.sources"
+    roots = root if isinstance(root, list) else []
+    for path in roots:
+        if not Path(path).is_dir():
+            yield f"data.root=[{', '.join(roots)}]: {path}: no such folder; must be a folder of npz clips"
     if bad := [name for name in map(str, sources) if not re.fullmatch(r"[\w-]+", name)]:
         yield f"data.sources.{bad[0]}: expected a name with only letters, digits, - and _"
     weights = [source["weight"] for source in sources.values()]

@@ -53,6 +53,8 @@ def test_a_list_of_folders_names_sources_after_them():
     assert {split.test for split in source.split.splits.values()} == {0.2}
     with pytest.raises(InputError, match=r"data\.root"):
         motion_of(compose_config(["data=mocap", "data.root=[a,x/a]"]))
+    with pytest.raises(InputError, match=r"nowhere: no such folder"):
+        compose_config(["data=mocap", "data.root=[a,nowhere]"])
 
 
 def test_named_sources_have_fractions_of_their_own():
