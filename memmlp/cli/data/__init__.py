@@ -78,7 +78,7 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
     has_protocol = any(override.startswith("data=") for override in overrides)
     config = compose_checked([*([] if has_protocol else ["data=mocap"]), *overrides, "data.root=."]).resolved
     config["data"]["root"] = str(root)
-    show_manifest(prepare_cache(build_motion(config).clips, out))
+    show_manifest(prepare_cache(build_motion(config).clips, out, overwrite=False))
 
 
 @data.command("inspect")
@@ -95,7 +95,7 @@ def inspect(path: Path) -> None:
         show_manifest(Manifest.load(path))
         return
     content = survey_folder(path)
-    show_skipped(content.skipped)
+    show_skipped(content.skipped, limit=None)  # no manifest lists them
     show_pairs("unusual", content.unusual, ": ")
     show_pairs("some or all of the motion is the same", content.duplicates)
     show_rates(content.clips)

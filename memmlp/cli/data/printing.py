@@ -84,15 +84,15 @@ def show_pairs(label: str, pairs: Mapping[str, str], sign: str = " = ") -> None:
     )
 
 
-def show_skipped(skipped: Sequence[SkippedFile]) -> None:
-    show_some([f"skipped {file.file}: {file.reason}" for file in skipped], "skipped")
+def show_skipped(skipped: Sequence[SkippedFile], limit: int | None = MAX_NAMES) -> None:
+    show_some([f"skipped {file.file}: {file.reason}" for file in skipped], "skipped", limit)
 
 
-def show_some(lines: list[str], label: str) -> None:
-    for line in lines[:MAX_NAMES]:
+def show_some(lines: list[str], label: str, limit: int | None = MAX_NAMES) -> None:
+    for line in lines[:limit]:
         click.echo(line)
-    if len(lines) > MAX_NAMES:
-        click.echo(f"{len(lines) - MAX_NAMES} more {label}")
+    if more := len(lines) - len(lines[:limit]):
+        click.echo(f"{more} more {label}")
 
 
 def show_exported(report: ExportReport, out: Path) -> None:

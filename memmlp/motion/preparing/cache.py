@@ -45,21 +45,26 @@ class ClipFolder:
     interpolation: str = SPLINES
 
 
-def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
+def prepare_cache(source: ClipFolder, out: Path, overwrite: bool = True) -> Manifest:
     """Prepare the cache in the folder `out`, unless it is current. Only one process does so at a time. Raises
     InputError if the root has no usable clips, the split is impossible, the folder cannot be written, or a
-    file is bad and `strict` is set; OSError if the disk is full or read-only."""
+    file is bad and `strict` is set; OSError if the disk is full or read-only. Without `overwrite`, raises
+    InputError also if the folder has other files, or the cache of other frames."""
     rest = load_rest_joints(source.body)
     clips = [source.root / file for file in find_clips(source.root).files]
     check_imported_body(clips, rest, f"data.body={source.body}")
     try:
         out.mkdir(parents=True, exist_ok=True)
+        if not overwrite:
+            _check_foreign_files(out)
         with Lock(out).hold():
             request = _compute_request_digest(source, rest)
             manifest = _load_if_current(out, request)
             if manifest and not (source.strict and manifest.skipped):
                 return manifest
             manifest = _plan_cache(source, rest, request)
+            if not overwrite:
+                _check_same_frames(out, manifest)
             _write_cache(source, rest, manifest, out)
             return manifest
     except OSError as error:
@@ -67,6 +72,22 @@ def prepare_cache(source: ClipFolder, out: Path) -> Manifest:
             error.filename = error.filename or str(out)
             raise
         raise InputError(f"{out}: the cache cannot be written ({error.strerror or error})") from error
+
+
+def _check_foreign_files(out: Path) -> None:
+    names = sorted(path.name for path in out.iterdir())
+    own = (MANIFEST, *(f"{part}.npy" for part in PARTS)) if Lock(out).list_claims() else ()
+    if foreign := [name for name in names if not name.startswith(".") and name not in own]:
+        raise InputError(f"{out}: has other files, such as {foreign[0]}; must be a new or empty folder")
+
+
+def _check_same_frames(out: Path, manifest: Manifest) -> None:
+    try:
+        same = Manifest.load(out).digest == manifest.digest
+    except InputError:  # unfinished, damaged, or of another format
+        return
+    if not same:
+        raise InputError(f"{out}: has a cache of other data or settings; must be a new or empty folder")
 
 
 def load_finished_cache(source: ClipFolder, out: Path) -> Manifest | None:

@@ -51,7 +51,8 @@ def test_a_cache_has_the_clips_of_training(memmlp, tmp_path: Path, monkeypatch: 
     (tmp_path / "clips").mkdir()
     monkeypatch.chdir(tmp_path)
     found: list[ClipFolder] = []
-    monkeypatch.setattr("memmlp.motion.preparing.cache.prepare_cache", lambda one, out: found.append(one))
+    preparing = "memmlp.motion.preparing.cache.prepare_cache"
+    monkeypatch.setattr(preparing, lambda one, out, overwrite: found.append(one))
     monkeypatch.setattr(commands, "show_manifest", lambda manifest: None)
     for words, train in (
         (["data.split.val=0.2"], ["data=mocap", "data.split.val=0.2"]),
@@ -62,6 +63,19 @@ def test_a_cache_has_the_clips_of_training(memmlp, tmp_path: Path, monkeypatch: 
         assert found[-1] == build_request(compose_config([*train, "data.root=clips"])).motion.clips
     bad = memmlp("data", "prepare", "clips", "--out", "cache", "data.split.val=2")
     assert one_line(bad, "data.split.val=2")
+
+
+def test_prepare_keeps_the_cache_of_other_data_and_inspect_lists_all_bad_files(memmlp, tmp_path: Path):
+    rng = np.random.default_rng(0)
+    for folder in ("a", "b"):
+        for take in range(4):
+            write_random_clip(tmp_path / folder / f"{take}.npz", rng)
+    for number in range(17):
+        (tmp_path / "a" / f"bad{number}.npz").touch()
+    assert memmlp("data", "prepare", "a", "--out", "cache").code == 0
+    assert one_line(memmlp("data", "prepare", "b", "--out", "cache"), "cache: has a cache of other data")
+    assert memmlp("data", "prepare", "a", "--out", "cache").code == 0
+    assert memmlp("data", "inspect", "a").out.count("skipped bad") == 17
 
 
 def test_folders_in_training_and_in_test_are_reported(memmlp, tmp_path: Path):

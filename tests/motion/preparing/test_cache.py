@@ -139,6 +139,25 @@ def test_unfinished_caches_and_those_of_another_format_are_made_again(root, tmp_
     assert str(tmp_path) not in path.read_text()
 
 
+def test_other_caches_and_files_are_kept_without_overwrite(root, tmp_path):
+    out = tmp_path / "cache"
+    first = prepare_cache(source(root), out, overwrite=False)
+    shutil.copytree(root, tmp_path / "copy")
+    same = prepare_cache(source(tmp_path / "copy"), out, overwrite=False)
+    assert (same.digest, Manifest.load(out)) == (first.digest, same)
+    before = {path: path.read_bytes() for path in out.glob("[!.]*")}
+    with pytest.raises(InputError, match="other data or settings"):
+        prepare_cache(source(root, min_frames=62), out, overwrite=False)
+    assert {path: path.read_bytes() for path in before} == before
+    for folder in (root / "a", tmp_path / "arrays"):
+        folder.mkdir(exist_ok=True)
+        np.save(folder / "train.npy", np.zeros(2))
+        files = sorted(folder.iterdir())
+        with pytest.raises(InputError, match=r"has other files, such as (0\.npz|train\.npy)"):
+            prepare_cache(source(root), folder, overwrite=False)
+        assert sorted(folder.iterdir()) == files
+
+
 def _digest(root: Path, cache: Path, said: Path) -> None:
     said.write_text(prepare_cache(source(root), cache).digest)
 
