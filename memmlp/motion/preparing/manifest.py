@@ -18,7 +18,7 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import SkippedFile
 from memmlp.motion.preparing.find_clips import Root
 
-FORMAT = 9  # version of the cache format; a new version makes all caches outdated
+FORMAT = 10  # version of the cache format; a new version makes all caches outdated
 MANIFEST = "manifest.json"
 PARTS = ("train", "val", "test")
 STILL = "still"  # `content` of all clips without motion
