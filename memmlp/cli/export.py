@@ -93,8 +93,8 @@ def export(
 ) -> None:
     """Export a finished run as ONNX, and check the file on whole test clips.
 
-    RUN is an id, the beginning of an id, or a folder. If the run already has a checked file of this form, the
-    command copies it.
+    RUN is an id, the beginning of an id, a folder, or a shipped network. If the run already has a checked
+    file of this form, the command copies it.
     """
     if out.suffix != ".onnx":
         raise InputError(f"--out {out}: must end in .onnx")

@@ -56,7 +56,7 @@ def predict(
     device: str,
     outputs: Path,
 ) -> None:
-    """Write the predictions of a finished RUN (id, beginning of an id, or folder) for clips.
+    """Write the predictions of a finished RUN (id, beginning of an id, folder, or shipped network) for clips.
 
     SOURCE is an AMASS npz file, a folder of npz files, or the name of a test clip. Predictions are at 60 Hz,
     on the body that the network was trained with. They start at the clip's second frame.

@@ -66,8 +66,9 @@ def render(
 ) -> None:
     """Draw predictions of finished RUNS beside the ground truth of a test clip, coloured by error.
 
-    RUNS are ids, beginnings of ids, or folders. A PNG has a row for each run and a column for each pose. A
-    GIF or MP4 shows the runs side by side at 30 frames per second. All runs share one colour scale.
+    RUNS are ids, beginnings of ids, folders, or shipped networks. A PNG has a row for each run and a column
+    for each pose. A GIF or MP4 shows the runs side by side at 30 frames per second. All runs share one colour
+    scale.
     """
     check_runs_exist(outputs, *runs)
     from memmlp.config.open_run import open_run

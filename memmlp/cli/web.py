@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 )
 @add_run_options
 def web(runs: tuple[str, ...], out: Path, clips: int, seconds: float, outputs: Path) -> None:
-    """Make a static web site of finished RUNS (ids, beginnings of ids, or folders).
+    """Make a static web site of finished RUNS (ids, beginnings of ids, folders, or shipped networks).
 
     In a browser, including a headset's, the site plays test clips and shows the user's body in a mirror, with
     the time of each pose (docs/guides/web.md). The first call downloads onnxruntime-web from npm's registry.

@@ -6,7 +6,14 @@ import click
 
 from memmlp.cli.data.importing import import_, skeleton, verify
 from memmlp.cli.data.printing import show_exported, show_manifest, show_pairs, show_rates, show_skipped
-from memmlp.cli.options import PATH, FiniteFloat, body_option, format_option, strict_option
+from memmlp.cli.options import (
+    PATH,
+    FiniteFloat,
+    body_option,
+    format_option,
+    overrides_argument,
+    strict_option,
+)
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 
@@ -63,7 +70,7 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
 
 @data.command("prepare")
 @click.argument("root", type=PATH)
-@click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
+@overrides_argument
 @click.option("--out", required=True, type=PATH, help="Folder for the cache.")
 def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
     """Prepare a folder of AMASS npz files as a memory-mappable cache for custom code.
@@ -84,7 +91,7 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
 @data.command("inspect")
 @click.argument("path", type=PATH)
 def inspect(path: Path) -> None:
-    """Show clips, hours, frame rates and bad files.
+    """Show clips, hours, frame rates, unusual clips, copies and bad files.
 
     PATH is a cache or a folder of npz files. For a cache, the command also shows the split.
     """

@@ -108,11 +108,10 @@ def _parse_floor(text: str) -> str | float:
 @up_option
 @click.option("--all", "show_all", is_flag=True, help="Show every file, not only files with faults.")
 def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_all: bool) -> None:
-    """Compare imported clips with the files.
+    """Import recordings again, and compare the joints with the files.
 
-    The command imports each file and compares the result with the file's joints. It prints the largest
-    position error of a mapped joint, with the file's bone lengths, and the largest angle error of a segment
-    (trunk, neck, arms, legs, feet). Impossible postures and lengths are faults. The command continues after
+    The command prints the largest position error of a mapped joint, with the file's bone lengths, and the
+    largest angle error of a segment (trunk, neck, arms, legs, feet). Impossible postures and lengths are faults. The command continues after
     bad files. It exits with 1 if a file has a fault or cannot be imported.
     """
     from memmlp.motion.clip import SkippedFile

@@ -41,7 +41,7 @@ ORIGIN_KEYS = (
 def show(run: str, config: bool, outputs: Path) -> None:
     """Show one run and its results.
 
-    RUN is an id, the beginning of an id, or a folder.
+    RUN is an id, the beginning of an id, a folder, or a shipped network.
     """
     from memmlp.report.tables.measured_run import load_measured_run
 
