@@ -111,8 +111,9 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_a
     """Import recordings again, and compare the joints with the files.
 
     The command prints the largest position error of a mapped joint, with the file's bone lengths, and the
-    largest angle error of a segment (trunk, neck, arms, legs, feet). Impossible postures and lengths are faults. The command continues after
-    bad files. It exits with 1 if a file has a fault or cannot be imported.
+    largest angle error of a segment (trunk, neck, arms, legs, feet). Impossible postures and lengths are
+    faults. The command continues after bad files. It exits with 1 if a file has a fault or cannot be
+    imported.
     """
     from memmlp.motion.clip import SkippedFile
     from memmlp.motion.importing.import_folder import ImportSettings, verify_folder
