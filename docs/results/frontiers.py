@@ -84,6 +84,7 @@ def find_cost(row: Row, mode: str, cost: str) -> float | None:
     return cells[cost].mean if cost in cells else row.costs.get(cost)
 
 
+WIDE = 2.0  # minimum ratio between the largest and the smallest error for a logarithmic axis
 SHIFT = 1.015  # ratio of neighbouring networks' places, so that intervals at one budget do not overlap
 LABELS = {COMPUTE: "training compute [TFLOP]", LATENCY: "time of a live step / yardstick's"}
 
@@ -103,8 +104,13 @@ def draw_frontiers(table: Table) -> bytes:
             first = axes = figure.add_subplot(1, len(points), number, sharey=first)
             _draw_points(axes, found, names, cost == COMPUTE)
             axes.set_xscale("log", subs=[])
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
-            axes.xaxis.set_major_formatter("{x:g}")
+            means = [point.mean for point in found]
+            wide = max(means) > WIDE * min(means)
+            if wide:
+                axes.set_yscale("log", subs=[])
+            for axis in (axes.xaxis, *[axes.yaxis] * wide):
+                axis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+                axis.set_major_formatter("{x:g}")
             axes.set(xlabel=LABELS[cost], ylabel=add_unit(choose_metric(table)))
             axes.grid(alpha=0.25)
         handles, labels = figure.axes[-1].get_legend_handles_labels()

@@ -14,7 +14,7 @@ from memmlp.cli.options import add_run_options, config_dir_option, overrides_arg
 from memmlp.cli.workers import Workers, add_worker_options, start_fleet
 from memmlp.common.components import find_chosen_settings
 from memmlp.common.errors import InputError
-from memmlp.common.files import digest, find_packaged_folder, write_json
+from memmlp.common.files import digest, write_json
 from memmlp.common.lease import Lock
 from memmlp.common.overrides import Override
 from memmlp.common.text_formats import join_command, make_console
@@ -44,6 +44,7 @@ def tune(overrides: tuple[str, ...], workers: Workers, status: bool, outputs: Pa
     training, or `+search.space.optim.lr={low: 1e-4, high: 1e-2,
     log: true}`. `search=NAME` selects conf/search/NAME.yaml. A restarted search continues where it stopped.
     """
+    from memmlp.config.compose import is_any_group
     from memmlp.sweep.search import results
     from memmlp.sweep.search.study import Study
 
@@ -59,8 +60,7 @@ def tune(overrides: tuple[str, ...], workers: Workers, status: bool, outputs: Pa
         study = Study.open(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)
         results.write_trials(study, setup.folder / "trials.csv")
-        groups = [path.name for path in find_packaged_folder("conf").iterdir() if path.is_dir()]
-        results.write_experiments(study, setup.folder, groups)
+        results.write_experiments(study, setup.folder, is_any_group)
     print_summary(setup, study)
 
 

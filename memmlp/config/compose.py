@@ -186,7 +186,7 @@ def _compose_job(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
     options = [
         override
         for override in parsed
-        if not isinstance(override.value(), dict) and _is_any_group(override.key_or_group)
+        if not isinstance(override.value(), dict) and is_any_group(override.key_or_group)
     ]
     values = [override for override in parsed if override not in options]
     special = args.config_name or args.config_path or args.config_dir or any(plugins.list_config_folders())
@@ -313,11 +313,12 @@ def _check_hidden(args: argparse.Namespace) -> None:
                 if used.is_file() and used.read_bytes() != path.read_bytes():
                     raise InputError(f"{path}: Hydra would use {used} instead; rename the file")
             group = option.parent.as_posix()
-            if path.stem == args.config_name if group == "." else _is_any_group(group):
+            if path.stem == args.config_name if group == "." else is_any_group(group):
                 _check_scalars(path)
 
 
-def _is_any_group(name: str) -> bool:
+def is_any_group(name: str) -> bool:
+    """Return whether a config group has this name: one of components, or one of files."""
     return is_group(name) or (find_packaged_folder("conf") / name).is_dir()
 
 

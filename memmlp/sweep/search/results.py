@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Collection
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,22 +48,22 @@ def write_trials(study: Study, path: Path) -> None:
     atomic_write(path, format_csv(rows))
 
 
-def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
+def write_experiments(study: Study, folder: Path, is_group: Callable[[str], bool]) -> list[Path]:
     """Write the best trial to FOLDER/experiment/best.yaml, and the rest of a Pareto front to trial-N.yaml,
-    and return the paths. Files of trials that are no longer on the front are removed. `groups` are the config
-    groups, of which a trial may choose options."""
+    and return the paths. Files of trials that are no longer on the front are removed. `is_group` tells config
+    groups, of which a trial chooses options, from keys."""
     folder = folder / "experiment"
     folder.mkdir(parents=True, exist_ok=True)
     best = study.list_best()
     files = [folder / ("best.yaml" if not n else f"trial-{one.number}.yaml") for n, one in enumerate(best)]
     for path, trial in zip(files, best, strict=True):
-        atomic_write(path, format_experiment(study, trial, groups))
+        atomic_write(path, format_experiment(study, trial, is_group))
     for stale in {*folder.glob("trial-[0-9]*.yaml")} - {*files}:
         stale.unlink()
     return files
 
 
-def format_experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
+def format_experiment(study: Study, trial: FrozenTrial, is_group: Callable[[str], bool]) -> str:
     """Return a trial as the text of a file for the config group `experiment`. It omits an `experiment=`
     override of the search's base, because an experiment cannot select another experiment."""
     search = study.search
@@ -73,7 +73,7 @@ def format_experiment(study: Study, trial: FrozenTrial, groups: Collection[str])
     for key, override in select_last_by_key(texts).items():
         if key == "experiment":
             continue
-        if key in groups:
+        if is_group(key):
             options.append({f"override /{key}": override.value or ""})
             continue
         *parents, leaf = key.split(".")

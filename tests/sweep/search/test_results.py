@@ -13,6 +13,7 @@ import yaml
 from optuna.distributions import FloatDistribution
 from optuna.trial import create_trial
 
+from memmlp.config.compose import is_any_group
 from memmlp.sweep.search import results
 from memmlp.sweep.search.search_file import Range
 from memmlp.sweep.search.study import Study, suggest_value
@@ -37,7 +38,7 @@ def test_trials_of_several_seeds_as_csv(tmp_path: Path):
     assert found == pytest.approx([first + 0.15, 0.3 / 2**0.5, first, 20 - first - 0.3])
     assert len(row["run"].split()) == 2
     assert (failed["state"], failed["MPJPE sd"], failed["reason"]) == ("fail", "", "the loss is nan")
-    (path,) = results.write_experiments(study, tmp_path, ["loss"])
+    (path,) = results.write_experiments(study, tmp_path, is_any_group)
     assert row["run"] in path.read_text()
 
 
@@ -55,7 +56,7 @@ def test_what_a_search_leaves(tmp_path: Path):
     rows = read_rows(study, tmp_path)
     assert [row["trial"] for row in rows] == list("012345")
     assert [float(row["MPJPE"]) for row in rows] == [trial.value for trial in study.trials]
-    (path,) = results.write_experiments(study, tmp_path, ["loss"])
+    (path,) = results.write_experiments(study, tmp_path, is_any_group)
     best = study.list_best()[0]
     content = yaml.safe_load(path.read_text())
     assert content["defaults"] == [{"override /loss": "manual"}, "_self_"]
@@ -63,20 +64,20 @@ def test_what_a_search_leaves(tmp_path: Path):
     assert path.read_text().startswith("# @package _global_\n")
 
 
-def write_best(folder: Path, space: dict, base: list[str], *groups: str) -> dict[str, Any]:
+def write_best(folder: Path, space: dict, base: list[str]) -> dict[str, Any]:
     study = fake_search.open_study(folder, space=space, n_trials=1, base=base)
     one = fake_search.director(study, folder)
     run = fake_search.begun(one.update(1))
     fake_search.log(run, fake_search.STEPS, 1.0)
     run.finish([])
     one.update(1)
-    (path,) = results.write_experiments(study, folder, groups)
+    (path,) = results.write_experiments(study, folder, is_any_group)
     return yaml.safe_load(path.read_text())
 
 
 def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path):
     space = {"hand": {"choices": ["off", "fk"]}, "memory": {"layers": {"choices": [[2], [2, 4]]}}}
-    content = write_best(tmp_path, space | {"seed": {"low": 3, "high": 9}}, [], "hand", "memory")
+    content = write_best(tmp_path, space | {"seed": {"low": 3, "high": 9}}, [])
     assert content["defaults"][0]["override /hand"] in ("off", "fk")
     assert content["memory"]["layers"] in ([2], [2, 4])
     assert content["seed"] in range(3, 10)
@@ -85,7 +86,7 @@ def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path)
 def test_of_a_key_in_the_base_and_the_trial_the_trials_value_is_written(tmp_path: Path):
     """And no experiment, since none can choose another."""
     space, base = {"hand": {"choices": ["fk", "position"]}}, ["hand=off", "experiment=manual_weights"]
-    hand, itself = write_best(tmp_path, space, base, "hand", "experiment")["defaults"]
+    hand, itself = write_best(tmp_path, space, base)["defaults"]
     assert (hand["override /hand"] in ("fk", "position"), itself) == (True, "_self_")
 
 
@@ -129,3 +130,13 @@ def test_importance_needs_trials_and_is_of_the_key_that_acts():
     (first, share), *rest = results.compute_importances(study)
     assert (first, len(rest), share > 0.5) == ("acts", 2, True)
     assert results.explain_missing_importances(study) is None
+
+
+def test_keys_of_a_chosen_component_are_below_its_group(tmp_path: Path):
+    space = {"optim": {"choices": ["muon", "adamw"], "lr": {"low": 0.1, "high": 0.2}}}
+    content = write_best(tmp_path, space | {"model": {"depth": {"low": 2, "high": 6}}}, ["model=agrol_mlp"])
+    chosen = {key: value for one in content["defaults"][:-1] for key, value in one.items()}
+    assert chosen["override /model"] == "agrol_mlp"
+    assert chosen["override /optim"] in ("muon", "adamw")
+    assert content["model"]["depth"] in range(2, 7)
+    assert 0.1 <= content["optim"]["lr"] <= 0.2
