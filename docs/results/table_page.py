@@ -35,7 +35,7 @@ RATIO = "ratio"  # column of a step's time over the yardstick's time
 TIME_COLUMNS = {
     "network ms": "*network ms*: features in, the network's outputs out.",
     "pose ms": "*pose ms*: from the trackers to the avatar's joints.",
-    RATIO: "The yardstick is a fixed chain of matrix products, timed in turn with the step.",
+    RATIO: "Yardstick: matrix products, timed in turn with the step.",
 }  # explanations of columns
 
 
